@@ -188,21 +188,19 @@ class Dense(Expansion):
         )
 
     def adapted(self, changes: Changes) -> Dense:
-        """The base's solution with these changes; it shares the base's factor if that is faster."""
-        base = self.base or self
-        count = len(base.database)
+        """The solution with these changes; it shares this one's factor if that is faster."""
+        count = len(self.database)
         replaced = changes.replaced
-        database = base.database.changed(changes)
+        database = self.database.changed(changes)
         first = int(replaced[0]) if len(replaced) else count
-        if len(replaced) and base.database.reference.mean.size <= SINGLE:
-            return Dense(self.hyperparameters, database, base)  # a fit takes less than a change
+        if len(replaced) and self.database.reference.mean.size <= SINGLE:
+            return Dense(self.hyperparameters, database, self)  # a fit takes less than a change
         if count - first > 2 * len(replaced) and len(replaced) <= _MOST_REMOVED * count:
-            solution = Dense(self.hyperparameters, database, base, count - len(replaced), replaced)
-            if solution.distinct >= base.distinct:
+            solution = Dense(self.hyperparameters, database, self, count - len(replaced), replaced)
+            if solution.distinct >= self.distinct:
                 return solution
-        return Dense(
-            self.hyperparameters, database, base, first if first >= _LEAST_SHARED * count else 0
-        )
+        same = first if first >= _LEAST_SHARED * count else 0
+        return Dense(self.hyperparameters, database, self, same)
 
     def extended(self, database: Database) -> Dense:
         """The solution of a database that begins with this one: the factors get a border."""
@@ -287,7 +285,7 @@ class Dense(Expansion):
     @cached_property
     def _covariance_solver(self) -> Array | _Bordered:
         parameters = self.hyperparameters
-        check_resolved(parameters, self.database.since(self.same), first=self.same)
+        check_resolved(parameters, self.database.take(slice(self.same, None)), first=self.same)
         if parameters.lambda_covariance == parameters.lambda_mean:
             return self._mean_solver
         return self._factorised(

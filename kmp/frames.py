@@ -25,17 +25,18 @@ from kmp.arrays.checks import (
 )
 from kmp.arrays.immutable import Immutable, frozen
 from kmp.arrays.linear_algebra import symmetric
+from kmp.functionals import Functionals
 from kmp.gaussians import Gaussians, check_gaussians, check_pairs, unchecked
 from kmp.kernel import Kernel, checked_kernel
 from kmp.mixture import GaussianMixture
+from kmp.outputs import inside, mixes
 from kmp.plot import Plotted, Points, Shown
 from kmp.predictor import Uncertainty, drawn_paths
 from kmp.primitive import KMP, Saved, checked_primitive
 from kmp.query import MotionPrediction
 
-_DIFFERENCE = (
-    3e-3  # of differences, over the kernel's length: error of fourth order and rounding balance
-)
+# step of differences over the kernel's length: slopes are best here, curvatures have 6 digits
+_DIFFERENCE = 1e-3
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -102,6 +103,18 @@ class CoordinateFrame(Immutable):
         """Normals of this frame in the world's coordinates. Raises ValueError if O differs."""
         check_gaussians("normals", normals, len(self.offset))
         return normals.affine(self.matrix, self.offset)
+
+
+def _localised(
+    frame: CoordinateFrame, primitive: KMP, inputs: Array, desired: Gaussians
+) -> Gaussians:
+    """Via-points (V, I) of the world in a frame, whose primitive this is."""
+    parameters = primitive.inner.solution.hyperparameters
+    points = Functionals(inputs)
+    shifted = unchecked(desired.mean - frame.offset, desired.covariance)
+    if mixes(parameters, points, frame.matrix, shifted).any():
+        return inside(parameters, points, frame.matrix, shifted)
+    return frame.localised(desired)
 
 
 def _check_frames(name: str, frames: Sequence[CoordinateFrame]) -> int:
@@ -222,7 +235,7 @@ class LocalKMP(Immutable, Plotted, Saved):
         return self.predict(queries).mean
 
     def jacobian(self, query: ArrayLike) -> Array:
-        """d mean / ds (O, I) at one query (I,), by differences, to some 1e-9 of its size.
+        """d mean / ds (O, I) at one query (I,), by differences, to some 1e-8 of its size.
 
         Raises ValueError as `KMP.jacobian` does.
         """
@@ -240,7 +253,8 @@ class LocalKMP(Immutable, Plotted, Saved):
     ) -> MotionPrediction:
         """The output at one query (I,) and its motion with the input, as `KMP.predict_motion`.
 
-        By differences, to some 1e-9 of their sizes. Raises ValueError as that does.
+        By differences: velocities to some 1e-8 of their sizes, accelerations to 1e-6. Raises
+        ValueError as that does.
         """
         s = self._checked("query", query)
         v = self._checked("velocity", velocity)
@@ -255,11 +269,11 @@ class LocalKMP(Immutable, Plotted, Saved):
 
     def _differences(self, query: Array, velocity: Array) -> tuple[Array, Array, Array]:
         """Mean and its two derivatives (O,) along a line through the query, of fourth order."""
-        speed = float(np.linalg.norm(velocity))
         mean = self.mean(query[None])[0]
-        if speed == 0.0:
+        speeds = [np.linalg.norm(np.sqrt(p.kernel.ell) * velocity) for p in self.primitives]
+        if max(speeds) == 0.0:
             return mean, 0.0 * mean, 0.0 * mean
-        step = _DIFFERENCE / (speed * np.sqrt(np.max(self.primitives[0].kernel.ell)))
+        step = _DIFFERENCE / max(speeds)
         first, second, third, fourth = self.mean(
             query + step * np.array([-2.0, -1.0, 1.0, 2.0])[:, None] * velocity
         )
@@ -327,15 +341,11 @@ class LocalKMP(Immutable, Plotted, Saved):
         if frame is not None:
             whole("frame", frame, least=0, most=len(self.frames) - 1)
         check_pairs("desired", via, desired, self.primitives[0].outputs)
-        adapted = tuple(
-            primitive.adapt(via, where.localised(desired), tolerance=tolerance)
-            if frame in (None, number)
-            else primitive
-            for number, (where, primitive) in enumerate(
-                zip(self.frames, self.primitives, strict=True)
-            )
-        )
-        return LocalKMP(adapted, self.frames)
+        adapted = list(self.primitives)
+        for n in range(len(adapted)) if frame is None else [frame]:
+            local = _localised(self.frames[n], adapted[n], via, desired)
+            adapted[n] = adapted[n].adapt(via, local, tolerance=tolerance)
+        return LocalKMP(tuple(adapted), self.frames)
 
     def _to_plot(self) -> Shown:
         """The references of all frames and the via-points, in the world's coordinates."""

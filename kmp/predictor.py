@@ -24,7 +24,7 @@ from kmp.low_rank import Features
 from kmp.problem.database import Changes, Database
 from kmp.problem.hyperparameters import AffineMean
 from kmp.query import MotionPrediction, Query
-from kmp.solution import BLOCK, Solution, least_variances, mean_at
+from kmp.solution import BLOCK, Solution, least_of_channels, mean_at
 
 _RESIDUAL = 1e-10  # residual of the features, as a share of k(s, s), in the uncertainty by distance
 
@@ -249,13 +249,9 @@ class Predictor(Immutable):
         With a `VelocityKernel`, that of a rate is 2 ell times larger. `adapt` raises ValueError for
         smaller variances.
         """
-        parameters = self.inner.solution.hyperparameters
-        anywhere = Functionals(np.zeros((1, self._dimensions)))
-        penalty = parameters.lambda_covariance
-        if self.representation == "low_rank":
-            penalty = min(penalty, parameters.lambda_mean)
-        least = least_variances(parameters, anywhere, penalty)[0, 0]
-        return float(least * parameters.prior_variances.max())
+        solution: Solution = self.inner.solution
+        variances = solution.hyperparameters.prior_variances
+        return float(least_of_channels(solution)[0] * variances.max())
 
     @property
     def prior_mean(self) -> Array | AffineMean:
@@ -282,7 +278,8 @@ class Predictor(Immutable):
 
     @cached_property
     def _spanned(self) -> Features:
-        return Features.spanning(self.kernel, self.inner.solution.functionals, tolerance=_RESIDUAL)
+        points = self.inner.solution.database.functionals
+        return Features.spanning(self.kernel, points, tolerance=_RESIDUAL)
 
     @cached_property
     def _dimensions(self) -> int:

@@ -12,7 +12,7 @@ import numpy as np
 
 from kmp.arrays.checks import RankReached
 from kmp.dense import SINGLE, Dense
-from kmp.low_rank import Features, LowRank
+from kmp.low_rank import FLOOR, Features, LowRank
 from kmp.outputs import (
     Decoupled,
     Mapped,
@@ -33,6 +33,7 @@ _LOW = 0.45
 # measured: r = 8 + 3.5 range sqrt(ell) over one input
 _RANK_AT_0 = 8.0
 _RANK_PER_LENGTH = 3.5
+_FEW = 64  # N C up to which all features that rounding allows cost nothing
 _ROUNDING = 1e-12  # a residual of this share of k(s, s) is rounding, and always allowed
 
 
@@ -48,9 +49,9 @@ def solved(
     if t is None:
         return _solved(parameters, database, representation, rank, tolerance)
     with variances_over_prior(parameters):
-        inside = inner_problem(parameters, database, t)
-        inner = _solved(*inside, representation, rank, tolerance)
-    return Mapped(parameters, database, t, inner, database).solved()
+        problem = inner_problem(parameters, database, t)
+        inner = _solved(*problem, representation, rank, tolerance)
+    return Mapped(parameters, database, t, inner).solved()
 
 
 def dense(parameters: Hyperparameters, database: Database) -> Dense | Decoupled:
@@ -77,6 +78,8 @@ def _solved(
     most = min(rank, int(_LOW * len(database) * parameters.kernel.channels)) if optional else rank
     points = database.functionals
     kernel = parameters.kernel
+    if len(points) * kernel.channels <= _FEW:
+        tolerance = min(tolerance, 2 * FLOOR)
     features, residual, values = Features.with_values(
         kernel, points, rank=most, tolerance=tolerance
     )
