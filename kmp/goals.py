@@ -11,6 +11,9 @@ roots R = L^-1 k of a dense solution, or lambda^1/2 L^-1 z of a low rank one.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import lapack
@@ -19,51 +22,103 @@ from kmp.arrays.checks import Array
 from kmp.arrays.linear_algebra import kron_identity
 from kmp.dense import Dense
 from kmp.functionals import Functionals
+from kmp.gaussians import Gaussians
 from kmp.kernel import between
 from kmp.low_rank import LowRank
-from kmp.problem.database import Database
-from kmp.solution import mean_of
+from kmp.outputs import Decoupled, Mapped, inside, of_group
+from kmp.problem.database import Changes, Database
+from kmp.solution import Solution, check_resolved, mean_of
 
 
-def moved_means(
+def moved_means(solution: Solution, changes: Sequence[Changes], queries: Functionals) -> Array:
+    """The moves (G, M, O) of a base's mean at M queries with each of G changes, of V points each.
+
+    Raises ValueError if rounding would hide a covariance.
+    """
+    added = Database(
+        Functionals.concatenated([change.functionals for change in changes]),
+        Gaussians.concatenated([change.points for change in changes]),
+    )
+    return _moved(solution, added, [change.replaced for change in changes], queries)
+
+
+def _moved(
+    solution: Any, added: Database, replaced: list[NDArray[np.intp]], queries: Functionals
+) -> Array:
+    """The moves (G, M, O), for the V points of each goal, one goal after the other; `replaced` are
+    the indices of the solution's points that each goal replaces.
+    """
+    points = added.functionals
+    if isinstance(solution, Mapped):
+        normals = inside(solution.inner.hyperparameters, points, solution.t, added.reference)
+        inner = _moved(solution.inner, Database(points, normals), replaced, queries)
+        return np.asarray(inner @ solution.t.T)
+    if not isinstance(solution, Decoupled):
+        return _of_system(solution, added, replaced, queries)
+    if not solution.is_decoupled(added.reference):
+        return _of_system(solution.together, added, replaced, queries)
+    moves = np.empty((len(replaced), len(queries), added.reference.outputs))
+    for part, group in zip(solution.parts, solution.groups, strict=True):
+        mine = Database(points, of_group(added.reference, group))
+        moves[:, :, group] = _of_system(part, mine, replaced, queries)
+    return moves
+
+
+def _of_system(
     solution: Dense | LowRank,
     added: Database,
     replaced: list[NDArray[np.intp]],
     queries: Functionals,
 ) -> Array:
-    """The moves (G, M, O) of the mean at M queries with each of G goals, by one triangular solve.
-
-    `added` has the V via-points of each goal, one goal after the other; `replaced` the indices of
-    the solution's points that each replaces.
-    """
-    database = solution.database
+    """The moves (G, M, O), by one triangular solve."""
+    parameters = solution.hyperparameters
+    goals = len(replaced)
+    count = len(added) // goals
+    moves = np.zeros((goals, len(queries), parameters.outputs))
+    if not count:
+        return moves
+    is_low_rank = solution.representation == "low_rank"
+    check_resolved(parameters, added, first=len(solution.database), both=is_low_rank)
+    if is_low_rank:
+        check_resolved(
+            parameters, added, first=len(solution.database), name="lambda_mean", both=True
+        )
+    means = added.reference.mean.reshape(goals, count, -1)
+    is_shared = _are_alike(added, replaced)
+    if is_shared:  # one system for all goals
+        added = added.take(slice(0, count))
     removed = np.unique(np.concatenate(replaced))
-    points = added.joined(
-        Database(database.functionals.take(removed), database.reference.take(removed))
-    )
-    outputs = points.reference.outputs
-    errors = points.reference.mean - mean_of(solution, points.functionals)
-    noise = solution.hyperparameters.lambda_mean * points.reference.covariance
+    points = added.joined(solution.database.take(removed))
+    before = mean_of(solution, points.functionals)
+    noise = parameters.lambda_mean * points.reference.covariance
     noise[len(added) :] *= -1.0
     posterior = _Posterior(solution, points.functionals, queries)
-    goals = len(replaced)
-    counts = np.array([len(rows) for rows in replaced])
-    moves = np.zeros((goals, len(queries), outputs))
-    for count in np.unique(counts):
-        mine = np.flatnonzero(counts == count)
-        added_rows = np.arange(len(added)).reshape(goals, -1)[mine]
-        removed_rows = len(added) + np.searchsorted(removed, np.array([replaced[g] for g in mine]))
-        rows = np.concatenate([added_rows, removed_rows.reshape(len(mine), -1)], axis=1)  # (G', U)
-        roots = posterior.roots(rows)
-        system = posterior.within(rows, roots)
-        diagonal = np.arange(rows.shape[1])
-        system[:, diagonal, :, diagonal] += noise[rows].transpose(1, 0, 2, 3)
-        size = rows.shape[1] * outputs
-        solved = np.linalg.solve(
-            system.reshape(len(mine), size, size), errors[rows].reshape(len(mine), size, 1)
-        )
-        moves[mine] = posterior.across(rows, roots, solved.reshape(*rows.shape, outputs))
+    for mine in [np.arange(goals)] if is_shared else _of_one_count(replaced):
+        systems = mine[:1] if is_shared else mine
+        added_rows = np.arange(len(added)).reshape(-1, count)[systems]
+        removed_rows = np.searchsorted(removed, np.array([replaced[g] for g in systems]))
+        rows = np.hstack([added_rows, len(added) + removed_rows.reshape(len(systems), -1)])
+        errors = points.reference.mean[rows] - before[rows]
+        errors = np.tile(errors, (len(mine) // len(systems), 1, 1))
+        errors[:, :count] = means[mine] - before[added_rows]
+        moves[mine] = posterior.moves(rows, noise[rows], errors)
     return moves
+
+
+def _are_alike(added: Database, replaced: list[NDArray[np.intp]]) -> bool:
+    """True if the goals differ in their means only."""
+    goals = len(replaced)
+    arrays = (added.inputs, added.functionals.along, added.reference.covariance)
+    blocks = (array.reshape(goals, -1) for array in arrays)
+    return all((block == block[0]).all() for block in blocks) and all(
+        np.array_equal(rows, replaced[0]) for rows in replaced
+    )
+
+
+def _of_one_count(replaced: list[NDArray[np.intp]]) -> list[NDArray[np.intp]]:
+    """The goals that replace the same number of points, for each number."""
+    counts = np.array([len(rows) for rows in replaced])
+    return [np.flatnonzero(counts == count) for count in np.unique(counts)]
 
 
 class _Posterior:
@@ -106,13 +161,25 @@ class _Posterior:
             goals, count, outputs, count, outputs
         )
 
+    def moves(self, rows: NDArray[np.intp], noise: Array, errors: Array) -> Array:
+        """The moves (G, M, O) for errors (G, U, O), of points (G, U) or of the same (1, U)."""
+        roots = self.roots(rows)
+        system = self.within(rows, roots)
+        diagonal = np.arange(rows.shape[1])
+        system[:, diagonal, :, diagonal] += noise.transpose(1, 0, 2, 3)
+        size = system.shape[1] * system.shape[2]
+        right = errors.reshape(len(rows), -1, size).mT
+        solved = np.linalg.solve(system.reshape(len(rows), size, size), right)
+        pulls = np.ascontiguousarray(solved.mT, dtype=np.float64)
+        return self.across(rows, roots, pulls.reshape(errors.shape))
+
     def across(self, rows: NDArray[np.intp], roots: Array, pulls: Array) -> Array:
         """P between the queries and the points of each goal (G, U), with their `roots`, times pulls
         (G, U, O): (G, M, O).
         """
-        goals = len(rows)
+        goals = len(pulls)
         near = self._across[:, _columns(rows, self._c)].transpose(1, 0, 2)  # (G, M C, U C)
-        near = near @ pulls.reshape(goals, near.shape[2], -1)
+        near = near @ pulls.reshape(goals, near.shape[2], -1)  # (G, M C, D)
         inner = roots.mT @ pulls.reshape(goals, roots.shape[1], -1)  # (G, p, D')
         explained = self._of_queries.T @ inner.transpose(1, 0, 2).reshape(inner.shape[1], -1)
         far = explained.reshape(len(explained), goals, -1).transpose(1, 0, 2)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,7 +43,7 @@ from kmp.query import MotionPrediction
 from kmp.radial import GaussianKernel, Matern32, Matern52
 from kmp.representation import dense
 from kmp.selection import Learned, Score
-from kmp.solution import Solution
+from kmp.solution import BaseSolution, Solution
 from kmp.time_kernels import PeriodicKernel, VelocityKernel
 
 _NAMES = (
@@ -64,6 +64,7 @@ _KERNEL = "kernel."  # begin of the names of a kernel's arrays, if `_BY_ELL` lac
 _OF_CONSTRAINTS = ("constraint_inputs", "constraint_normals", "constraint_bounds")
 _OF_LOW_RANK = ("pivots", "information", "features")
 KIND = "kind"
+_Some = TypeVar("_Some", bound=Solution)
 _KINDS: dict[str, Any] = {
     kind.__name__: kind
     for kind in (
@@ -121,7 +122,7 @@ def from_arrays(
 
 
 def _of_primitive(primitive: KMP) -> dict[str, NDArray[Any]]:
-    base = primitive.base.inner.solution
+    base = cast(BaseSolution, primitive.base.inner.solution)
     changes = primitive.inner.changes
     solution = primitive.inner.solution
     parameters = base.hyperparameters
@@ -176,7 +177,9 @@ def _primitive(arrays: Mapping[str, NDArray[Any]], kinds: Mapping[str, Any]) -> 
     has_constraints = any(name in arrays for name in _OF_CONSTRAINTS)
     if has_constraints and base.representation == "dense":
         base = _weighted(as_one(base), "base_weights", arrays)
-    solution = base.adapted(changes) if len(changes.inputs) else base
+    solution: Solution = base
+    if len(changes.inputs):
+        solution = base.adapted(changes)
     if has_constraints:
         solution = _constrained(solution, arrays)
     unadapted = KMP(Inner.of_base(base))
@@ -203,7 +206,7 @@ def _constrained(solution: Solution, arrays: Mapping[str, NDArray[Any]]) -> Solu
     return constrained(solution, constraints)
 
 
-def _base(arrays: Mapping[str, NDArray[Any]], kinds: Mapping[str, Any]) -> Solution:
+def _base(arrays: Mapping[str, NDArray[Any]], kinds: Mapping[str, Any]) -> BaseSolution:
     inputs = numbers("base_inputs", arrays["base_inputs"], "N", "I")
     reference = _normals("base", arrays)
     check_pairs("base_mean", inputs, reference, reference.outputs)
@@ -224,12 +227,12 @@ def _base(arrays: Mapping[str, NDArray[Any]], kinds: Mapping[str, Any]) -> Solut
         return _weighted(_plain(parameters, database, arrays), "base_weights", arrays)
     t = numbers("output_map", arrays["output_map"], reference.outputs, reference.outputs)
     inner = _plain(*inner_problem(parameters, database, t), arrays)
-    return _weighted(Mapped(parameters, database, t, inner, database), "base_weights", arrays)
+    return _weighted(Mapped(parameters, database, t, inner), "base_weights", arrays)
 
 
 def _plain(
     parameters: Hyperparameters, database: Database, arrays: Mapping[str, NDArray[Any]]
-) -> Solution:
+) -> BaseSolution:
     """The solution without its outputs' map."""
     if "pivots" not in arrays:
         return dense(parameters, database)
@@ -274,7 +277,7 @@ def _normals(of: str, arrays: Mapping[str, NDArray[Any]]) -> Gaussians:
     return unchecked(mean, covariances(f"{of}_covariance", arrays[f"{of}_covariance"], *mean.shape))
 
 
-def _weighted(solution: Solution, name: str, arrays: Mapping[str, NDArray[Any]]) -> Solution:
+def _weighted(solution: _Some, name: str, arrays: Mapping[str, NDArray[Any]]) -> _Some:
     parameters = solution.hyperparameters
     return solution.with_weights(
         numbers(name, arrays[name], len(solution.centres), parameters.outputs)
