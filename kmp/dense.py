@@ -223,6 +223,8 @@ class Dense(Expansion):
         c = self.hyperparameters.kernel.channels
         d = self.hyperparameters.channel_outputs
         covariance = self.database.reference.covariance
+        if covariance[0, 0, 1:d].any():
+            return d
         first = covariance.reshape(-1, c, d, c, d)[:, :, 0, :, 0]
         return 1 if np.array_equal(covariance, kron_identity(first, d)) else d
 
@@ -246,8 +248,8 @@ class Dense(Expansion):
         """
         parameters = self.hyperparameters
         kernel = parameters.kernel
-        share = parameters.lambda_covariance * self.database.least_shares(kernel).min()
-        if kernel.channels > 1 or share < _PRECISE:
+        precise = _PRECISE / parameters.lambda_covariance
+        if kernel.channels > 1 or not self.database.exceeds(kernel, precise):
             return None
         lower, _ = lapack.dpotri(self.covariance_factor, lower=1)
         inverse = np.tril(lower) + np.tril(lower, -1).T
@@ -285,12 +287,17 @@ class Dense(Expansion):
     @cached_property
     def _covariance_solver(self) -> Array | _Bordered:
         parameters = self.hyperparameters
-        check_resolved(parameters, self.database.take(slice(self.same, None)), first=self.same)
+        check_resolved(parameters, self._added, first=self.same)
         if parameters.lambda_covariance == parameters.lambda_mean:
             return self._mean_solver
         return self._factorised(
             parameters.lambda_covariance, self.base.covariance_factor if self.base else None
         )
+
+    @property
+    def _added(self) -> Database:
+        """The points whose factor the base does not share."""
+        return self.database.take(slice(self.same, None)) if self.same else self.database
 
     def _factorised(self, penalty: float, base_factor: Array | None) -> Array | _Bordered:
         """The Cholesky factor with this lambda, bordering the base's if that is shared."""
@@ -350,15 +357,15 @@ class Dense(Expansion):
         o = c * d
         points = self.database.functionals
         count = len(self.database)
-        changed = len(self.database) - first
+        changed = count - first
         rows = np.zeros((changed, c, d, count, c, d))
-        k = between(kernel, points.take(slice(first, None)), points).reshape(changed, c, count, c)
+        k = between(kernel, self._added.functionals, points).reshape(changed, c, count, c)
         for i in range(d):
             rows[:, :, i, :, :, i] = k
-        diagonal = np.arange(changed)
-        blocks = rows.reshape(changed, o, count, o)
+        blocks = rows.reshape(changed, o, count, o)[:, :, first:]
         covariance = self.database.reference.covariance[first:].reshape(
             changed, c, outputs, c, outputs
         )[:, :, :d, :, :d]
-        blocks[diagonal, :, diagonal + first, :] += penalty * covariance.reshape(changed, o, o)
+        diagonal = np.einsum("ninj->nij", blocks)  # a view
+        diagonal += penalty * covariance.reshape(changed, o, o)
         return rows.reshape(changed * o, count * o)

@@ -137,6 +137,8 @@ def check_resolved(
     names is sufficient for this lambda, or for `both`.
     """
     penalty = parameters.lambda_mean if name == "lambda_mean" else parameters.lambda_covariance
+    if points.exceeds(parameters.kernel, _RESOLVED / penalty):
+        return
     least = penalty * points.least_shares(parameters.kernel)
     for n in np.flatnonzero(least < _RESOLVED)[:1]:
         enough = penalty * _RESOLVED / max(least[n], 1e-300)
@@ -157,7 +159,7 @@ def check_resolved(
 def is_resolved(parameters: Hyperparameters, points: Database) -> bool:
     """True if rounding of k(s, s) hides lambda Sigma with neither lambda."""
     penalty = min(parameters.lambda_mean, parameters.lambda_covariance)
-    return bool((penalty * points.least_shares(parameters.kernel) >= _RESOLVED).all())
+    return points.exceeds(parameters.kernel, _RESOLVED / penalty)
 
 
 def least_variances(parameters: Hyperparameters, points: Functionals, penalty: float) -> Array:
@@ -180,10 +182,10 @@ def resolved(parameters: Hyperparameters, points: Functionals, normals: Gaussian
     """The normals of N points, with the least variance for exact outputs instead of 0, and for free
     ones one that hardly pulls.
     """
+    if not normals.has_limits:
+        return normals
     exact = normals.exact
     free = normals.free
-    if not (exact.any() or free.any()):
-        return normals
     penalty = min(parameters.lambda_mean, parameters.lambda_covariance)
     least = least_variances(parameters, points, penalty).repeat(parameters.channel_outputs, axis=1)
     least = least * np.tile(parameters.prior_variances, parameters.kernel.channels)

@@ -59,8 +59,6 @@ class Changes(NamedTuple):
 class Database(Immutable):
     """N reference points: functionals of the output, and a normal distribution of each."""
 
-    _not_pickled = frozenset({"_known_shares"})
-
     functionals: Functionals  # N
     reference: Gaussians  # N
 
@@ -73,18 +71,24 @@ class Database(Immutable):
         return self.functionals.inputs
 
     def least_shares(self, kernel: Kernel) -> Array:
-        """The least eigenvalue (N,) of each Sigma_n, as a share of k(s_n, s_n) of its channel.
+        """The least eigenvalue (N,) of each Sigma_n, as a share of k(s_n, s_n) of its channel."""
+        scale = np.sqrt(self._variances(kernel))
+        shares = self.reference.covariance / (scale[:, :, None] * scale[:, None, :])
+        return np.asarray(np.linalg.eigvalsh(shares)[:, 0])
 
-        Of S^-1 Sigma_n S^-1, where S^2 is the diagonal of k(s_n, s_n). The last kernel's are kept.
-        """
-        cached: tuple[Kernel, Array] | None = self.__dict__.get("_known_shares")
-        if cached is None or cached[0] is not kernel:
-            repeats = self.reference.outputs // kernel.channels
-            scale = np.sqrt(variances(kernel, self.functionals)).repeat(repeats, axis=1)
-            covariance = self.reference.covariance / (scale[:, :, None] * scale[:, None, :])
-            cached = kernel, frozen(np.linalg.eigvalsh(covariance)[:, 0])
-            self.__dict__["_known_shares"] = cached
-        return cached[1]
+    def exceeds(self, kernel: Kernel, share: float) -> bool:
+        """True if all `least_shares` are above this one."""
+        own = share * self._variances(kernel)
+        try:
+            np.linalg.cholesky(self.reference.covariance - own[:, :, None] * np.eye(own.shape[1]))
+        except np.linalg.LinAlgError:
+            return False
+        return True
+
+    def _variances(self, kernel: Kernel) -> Array:
+        """The diagonal (N, O) of k(s_n, s_n) (x) I."""
+        outputs = self.reference.outputs // kernel.channels
+        return np.asarray(variances(kernel, self.functionals).repeat(outputs, axis=1))
 
     def take(self, chosen: NDArray[np.intp] | slice) -> Database:
         """The chosen points."""

@@ -85,9 +85,9 @@ class Hyperparameters(Immutable):
                 )
         else:
             matrix = None
-            offset = numbers(
-                "prior_mean", np.zeros(outputs) if prior_mean is None else prior_mean, outputs
-            )
+            offset = frozen(np.zeros(outputs))
+            if prior_mean is not None:
+                offset = numbers("prior_mean", prior_mean, outputs)
         if kernel.channels > 1:
             values = outputs // kernel.channels
             slopes, of_rates = (
