@@ -277,23 +277,23 @@ class Decoupled(Expansion):
         return out
 
     def adapted(self, changes: Changes) -> Solution:
-        if not self.is_decoupled(changes.points):
-            return self.together.adapted(changes)
+        if not self._is_decoupled(changes.points):
+            return self._together.adapted(changes)
         parts = tuple(
-            part.adapted(changes._replace(points=of_group(changes.points, group)))
+            part.adapted(changes._replace(points=_of_group(changes.points, group)))
             for part, group in zip(self.parts, self.groups, strict=True)
         )
         return replace(self, database=self.database.changed(changes), parts=parts)
 
     @cached_property
-    def together(self) -> Dense | LowRank:
+    def _together(self) -> Dense | LowRank:
         """The solution as one system."""
         first = self.parts[0]
         if isinstance(first, LowRank):
             return LowRank.fit(self.hyperparameters, self.database, first.features)
         return Dense(self.hyperparameters, self.database)
 
-    def is_decoupled(self, normals: Gaussians) -> bool:
+    def _is_decoupled(self, normals: Gaussians) -> bool:
         """True if no covariance couples two groups."""
         number = np.empty(normals.outputs, dtype=np.intp)
         for n, group in enumerate(self.groups):
@@ -327,7 +327,7 @@ class Decoupled(Expansion):
         parts = tuple(
             solution(
                 _parameters_of(parameters, group),
-                Database(database.functionals, of_group(database.reference, group)),
+                Database(database.functionals, _of_group(database.reference, group)),
                 group,
             )
             for group in groups
@@ -367,8 +367,7 @@ def decoupled_groups(
     return tuple((every + np.array(group)).ravel() for group in groups)
 
 
-def of_group(normals: Gaussians, group: NDArray[np.intp]) -> Gaussians:
-    """The normals of a group of outputs."""
+def _of_group(normals: Gaussians, group: NDArray[np.intp]) -> Gaussians:
     return unchecked(normals.mean[:, group], normals.covariance[:, group[:, None], group])
 
 

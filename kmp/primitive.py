@@ -46,6 +46,7 @@ from kmp.representation import LARGE, solved
 from kmp.solution import BaseSolution, Solution, mean_of, resolved
 from kmp.time_kernels import VelocityKernel
 
+_SAME_GOAL = 1e-12  # differences of goals below this share of the largest are rounding
 _REACH_STEPS = 300  # number of distances at which a via-point's effect is computed
 
 
@@ -205,7 +206,8 @@ class KMP(Predictor, Plotted, Saved):
         points = changes.functionals.take(remaining)
         normals = changes.points.take(remaining)
         before = self.base.inner.changes
-        return self._with(self._changes(before, points, normals, self._tolerance(tolerance)))
+        changes = self._changes(before, points, normals, self._tolerance(tolerance))
+        return _combined(self.base, changes, self._constraints)
 
     def adapt_jacobian(self, inputs: ArrayLike, jacobians: ArrayLike, *, deviation: float) -> KMP:
         """A new primitive with these Jacobians dxi/ds at inputs (V, I): jacobians (V, O, I).
@@ -303,11 +305,16 @@ class KMP(Predictor, Plotted, Saved):
         if len(points) == 0:
             return self
         parameters = self.inner.solution.hyperparameters
+        adapted = self._toward(points, desired, tolerance)
         desired = resolved(parameters, points, desired)
-        changes = self._changes(self.inner.changes, points, desired, tolerance)
-        adapted = self._with(changes)
         warn_of_missed(desired, mean_of(adapted.inner.solution, points), parameters)
         return adapted
+
+    def _toward(self, points: Functionals, desired: Gaussians, tolerance: float) -> KMP:
+        """The primitive through these points, whether it misses one or not."""
+        desired = resolved(self.inner.solution.hyperparameters, points, desired)
+        changes = self._changes(self.inner.changes, points, desired, tolerance)
+        return _combined(self.base, changes, self._constraints)
 
     def _changes(
         self, before: Changes, points: Functionals, desired: Gaussians, tolerance: float
@@ -320,10 +327,6 @@ class KMP(Predictor, Plotted, Saved):
             Functionals.concatenated([before.functionals.take(remaining), points]),
             Gaussians.concatenated([before.points.take(remaining), desired]),
         )
-
-    def _with(self, changes: Changes) -> KMP:
-        """The primitive with other changes of its base."""
-        return _combined(self.base, changes, self._constraints)
 
     def _tolerance(self, tolerance: float | None) -> float:
         if tolerance is None:
@@ -443,9 +446,7 @@ class KMP(Predictor, Plotted, Saved):
         desired = Gaussians.of(
             self.mean(s[None]) + 1.0, deviation=np.repeat([0.0, np.inf], values)[: self.outputs]
         )
-        point = Functionals(s[None])
-        resolved_point = resolved(self.inner.solution.hyperparameters, point, desired)
-        adapted = self._with(self._changes(self.inner.changes, point, resolved_point, 0.0))
+        adapted = self._toward(Functionals(s[None]), desired, 0.0)
         reach = np.empty(len(s))
         for i, farthest in enumerate(self._farthest(s)):
             r = np.linspace(0.0, farthest, _REACH_STEPS)
@@ -569,25 +570,37 @@ class Alternatives(Sequence[KMP]):
     def mean(self, queries: ArrayLike) -> Array:
         """The means (G, M, O) of all G primitives at queries (M, I), equal to theirs to rounding.
 
-        Of goals with the same number of via-points it takes hardly more time than of one. Raises
-        ValueError as `KMP.mean` does.
+        Of goals that differ in their means only, at the same inputs, it takes hardly more time than
+        of one. Raises ValueError as `KMP.mean` does.
+        """
+        first = self._desired[0]
+        differ_in_means = all(
+            np.array_equal(inputs, self._inputs[0])
+            and np.array_equal(desired.covariance, first.covariance)
+            for inputs, desired in zip(self._inputs, self._desired, strict=True)
+        )
+        if differ_in_means and self._primitive._constraints is None:  # noqa: SLF001 (of its own kind)
+            return self._by_directions(queries)
+        return np.stack([adapted.mean(queries) for adapted in self])
+
+    def _by_directions(self, queries: ArrayLike) -> Array:
+        """The means (G, M, O), which are affine in the goals: by one adaptation for each of the
+        directions in which these differ.
         """
         primitive = self._primitive
-        queries_at = Functionals(primitive._checked_many(queries))  # noqa: SLF001 (of its own kind)
-        changes = [self._changes(n) for n in range(len(self))]
-        has_constraints = constraints_of(primitive.inner.solution) is not None
-        if len({len(change.points) for change in changes}) > 1 or has_constraints:
-            return np.stack([adapted.mean(queries) for adapted in self])
-        from kmp.goals import moved_means  # rarely used
-
-        base = primitive.base.inner.solution
-        return mean_of(base, queries_at) + moved_means(base, changes, queries_at)
-
-    def _changes(self, n: int) -> Changes:
-        """The changes of the base for the goal of this number."""
-        primitive = self._primitive
-        points = Functionals(self._inputs[n])
-        desired = resolved(primitive.inner.solution.hyperparameters, points, self._desired[n])
-        return primitive._changes(  # noqa: SLF001 (of its own kind)
-            primitive.inner.changes, points, desired, self._tolerance
+        points = Functionals(self._inputs[0])
+        first = self._desired[0]
+        away = np.stack([desired.mean - first.mean for desired in self._desired])
+        units = primitive.inner.solution.hyperparameters.prior_deviations
+        shares, sizes, directions = np.linalg.svd(
+            (away / units).reshape(len(self), -1), full_matrices=False
         )
+        mean = self[0].mean(queries)
+        means = np.tile(mean, (len(self), 1, 1))
+        for share, size, direction in zip(shares.T, sizes, directions, strict=True):
+            if size > _SAME_GOAL * sizes[0]:
+                step = size * direction.reshape(first.mean.shape) * units
+                goal = unchecked(first.mean + step, first.covariance)
+                moved = primitive._toward(points, goal, self._tolerance)  # noqa: SLF001
+                means += share[:, None, None] * (moved.mean(queries) - mean)
+        return means
