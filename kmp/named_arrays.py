@@ -142,9 +142,9 @@ def _of_primitive(primitive: KMP) -> dict[str, NDArray[Any]]:
         **kernel_arrays,
         "lambda_mean": np.array(parameters.lambda_mean),
         "lambda_covariance": np.array(parameters.lambda_covariance),
-        "prior_mean": parameters.prior_offset
-        if parameters.prior_matrix is None
-        else parameters.prior_columns,
+        "prior_mean": parameters.prior_columns
+        if parameters.prior_matrix.any()
+        else parameters.prior_offset,
     }
     if by_ell and kernel.period is not None:
         arrays["period"] = np.array(kernel.period)

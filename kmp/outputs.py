@@ -86,11 +86,10 @@ def inner_problem(
 ) -> tuple[Hyperparameters, Database]:
     """The problem in the coordinates x = T^-1 y."""
     inverse = np.linalg.inv(t)
-    matrix = parameters.prior_matrix
     inner = replace(
         parameters,
         prior_offset=frozen(inverse @ parameters.prior_offset),
-        prior_matrix=None if matrix is None else frozen(inverse @ matrix),
+        prior_matrix=frozen(inverse @ parameters.prior_matrix),
         prior_covariance=None,
     )
     points = database.functionals
@@ -164,7 +163,7 @@ def _of_fixed(
     noise = noise + np.diag(np.maximum(least - variance[fixed], 0.0))
     rest = np.sqrt(_MIXED_FREE * _prior_variances(parameters, point, np.eye(len(t)))[0])
     null = rest[:, None] * (np.eye(len(t)) - back @ rows) * rest
-    before = np.broadcast_to(parameters.prior_at(point), (1, len(t)))[0]
+    before = parameters.prior_at(point)[0]
     mean = before + back @ (normal.mean[0, fixed] - rows @ before)
     return mean, symmetric(back @ noise @ back.T + null)
 
@@ -372,11 +371,10 @@ def _of_group(normals: Gaussians, group: NDArray[np.intp]) -> Gaussians:
 
 
 def _parameters_of(parameters: Hyperparameters, group: NDArray[np.intp]) -> Hyperparameters:
-    matrix = parameters.prior_matrix
     return replace(
         parameters,
-        prior_offset=parameters.prior_offset[group],
-        prior_matrix=None if matrix is None else matrix[group],
+        prior_offset=frozen(parameters.prior_offset[group]),
+        prior_matrix=frozen(parameters.prior_matrix[group]),
     )
 
 

@@ -90,11 +90,10 @@ class Predictor(Immutable):
         if (mean_and_row := self._compiled_mean(s)) is not None:
             return mean_and_row[0]
         s = self._checked_many(s)
-        return (
-            self.inner.query.mean(self.inner.query.row(s[0]))[None]
-            if len(s) == 1
-            else mean_at(self.inner.solution, s)
-        )
+        if len(s) == 1:
+            query = self.inner.query
+            return query.mean(s[0], query.row(s[0]))[None]
+        return mean_at(self.inner.solution, s)
 
     def predict(self, queries: ArrayLike) -> Gaussians:
         """xi(s) with its covariance at queries (M, I): M normals.
@@ -110,10 +109,9 @@ class Predictor(Immutable):
             return unchecked(mean_and_row[0], compiled.covariance(mean_and_row[1])[None])
         s = self._checked_many(s)
         if len(s) == 1:
-            row = self.inner.query.row(s[0])
-            return unchecked(
-                self.inner.query.mean(row)[None], self.inner.query.covariance(row.kernel)[None]
-            )
+            query = self.inner.query
+            row = query.row(s[0])
+            return unchecked(query.mean(s[0], row)[None], query.covariance(row)[None])
         batches = [s[i : i + BLOCK] for i in range(0, len(s), BLOCK)]
         posterior = [
             self.inner.solution.posterior_covariance(self._rows(batch)) for batch in batches
@@ -188,7 +186,7 @@ class Predictor(Immutable):
             and (jacobian := compiled.jacobian(s)) is not None
         ):
             return jacobian
-        return self.inner.query.jacobian(self.inner.query.row(self._one_query(s)))
+        return np.asarray(self.inner.query.jacobians(self._one_query(s)[None])[0])
 
     def jacobians(self, queries: ArrayLike) -> Array:
         """dxi/ds at queries (M, I): (M, O, I), equal to `jacobian` but for rounding.
@@ -208,7 +206,7 @@ class Predictor(Immutable):
         """
         s = self._one_query(query)
         v = self._checked("direction", direction)
-        return self.inner.query.curvature(self.inner.query.row(s), v)
+        return self.inner.query.curvature(s, v)
 
     def uncertainty(self, queries: ArrayLike) -> Uncertainty:
         """The covariance at queries (M, I), by its causes: differing demonstrations, distance.

@@ -142,7 +142,8 @@ class _System:
         )
 
     def _check(self, penalty: float) -> None:
-        parameters = Hyperparameters(self.kernel, penalty, penalty, self.fold.prior_mean)
+        matrix = np.zeros((self.fold.reference.outputs, self.fold.inputs.shape[1]))
+        parameters = Hyperparameters(self.kernel, penalty, penalty, self.fold.prior_mean, matrix)
         check_resolved(parameters, self.fold.database)
 
     @property

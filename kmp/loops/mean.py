@@ -144,7 +144,7 @@ def means(
 
     Returns true if all is finite. `places` (R',) are the indices of the centres that are
     derivatives along `along` (R', I); `coordinates` (1 + I,) the kernel's scale and the stretch of
-    each input; `prior` the prior mean's offset (O, 1), or offset and matrix (O, 1 + I).
+    each input; `prior` the prior mean's offset and matrix (O, 1 + I).
     """
     scale = coordinates[0]
     stretch = coordinates[1:]
@@ -161,7 +161,7 @@ def means(
         _derive(x, table, places, along, scale, values)
         for o in range(outputs):
             mean = sum_products(values, table[inputs + o]) + prior[o, 0]
-            for i in range(prior.shape[1] - 1):
+            for i in range(inputs):
                 mean += prior[o, 1 + i] * queries[m, i]
             out[m, o] = mean
             total += mean
@@ -209,6 +209,6 @@ def slopes(
             pull[r] = values[r] * weights[r]
         for i in range(inputs):
             slope = -2.0 * scale * (out[o, i] + sum_products(pull, offsets[i])) * stretch[i]
-            out[o, i] = slope + prior[o, 1 + i] if prior.shape[1] > 1 else slope
+            out[o, i] = slope + prior[o, 1 + i]
             total += out[o, i] + x[i]
     return math.isfinite(total)
