@@ -81,7 +81,7 @@ class CompiledQuery(Immutable):
     def _reads(self) -> tuple[Array, NDArray[np.intp], Array, Array, Array]:
         """The arguments of `means` and `slopes` other than the queries."""
         coordinates = frozen(np.concatenate([[self.scale], self.stretch]))
-        directions = self.along[self.places] if len(self.places) else self.along
+        directions = frozen(self.along[self.places])
         return self.table, self.places, directions, coordinates, self.query.prior_mean
 
     def mean(self, queries: Array) -> tuple[Array, Array] | None:
