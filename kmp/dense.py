@@ -35,7 +35,6 @@ _LEAST_SHARED = 0.75
 _MOST_REMOVED = 0.125  # removing points is faster than a fit up to this share of them
 # least lambda_c Sigma / k(s, s) from which a product with the inverse is exact to 1e-9
 _PRECISE = 1e-2
-_COLUMNS = 64  # columns of a factor that are copied at once
 
 
 class _Removed(NamedTuple):
@@ -100,15 +99,9 @@ class _Bordered(NamedTuple):
 
     def whole(self) -> Array:
         """The factor as one array (p + m, p + m)."""
-        p = len(self.base)
-        n = sum(self.border.shape)
-        factor = np.zeros((n, n), order="F")  # LAPACK's order: each use would copy another
-        # pages above the diagonal are not written, and take no memory
-        for a in range(0, p, _COLUMNS):
-            factor[a:p, a : min(a + _COLUMNS, p)] = self.base[a:, a : min(a + _COLUMNS, p)]
-        factor[p:, :p] = self.border.T
-        factor[p:, p:] = self.corner
-        return frozen(factor)
+        above = np.zeros(self.border.shape)
+        factor = np.block([[self.base, above], [self.border.T, self.corner]])
+        return frozen(np.asfortranarray(factor))
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -17,9 +17,8 @@ from kmp.arrays.checks import (
     Seed,
     brief,
     check_some,
-    not_negative,
+    checked_demonstrations,
     numbers,
-    pair,
     parts_of,
     whole,
 )
@@ -169,26 +168,21 @@ class LocalKMP(Immutable, Plotted, Saved):
         Raises ValueError if a demonstration does not have F frames, and as these two do.
         """
         kernel = checked_kernel(kernel)
-        parts_of("demonstrations", demonstrations)
+        data = checked_demonstrations(demonstrations)
         counts = [
             _check_frames(f"frames[{h}]", frame_set)
             for h, frame_set in enumerate(parts_of("frames", frames))
         ]
-        if len(counts) != len(demonstrations) or len(set(counts)) != 1:
-            count = len(demonstrations)
+        if len(counts) != len(data) or len(set(counts)) != 1:
             raise ValueError(
-                f"frames: {brief(counts)} given for {count} demonstrations, as many for each "
+                f"frames: {brief(counts)} given for {len(data)} demonstrations, as many for each "
                 "needed."
             )
-        where = numbers("inputs", inputs, "N", "I")
-        data = [
-            pair(f"demonstrations[{h}]", demonstration)
-            for h, demonstration in enumerate(demonstrations)
-        ]
+        where = numbers("inputs", inputs, "N", data[0][0].shape[1])
         primitives = []
         for f in range(counts[0]):
             samples = [
-                np.hstack([numbers("inputs", s, "T", where.shape[1]), frame[f].local(xi)])
+                np.hstack([s, frame[f].local(xi)])
                 for (s, xi), frame in zip(data, frames, strict=True)
             ]
             mixture = GaussianMixture.fit(
@@ -213,12 +207,7 @@ class LocalKMP(Immutable, Plotted, Saved):
 
     def placed(self, frames: Sequence[CoordinateFrame]) -> LocalKMP:
         """The skill with its F frames moved. Raises ValueError if F or O differs."""
-        if _check_frames("frames", frames) and [len(frame.offset) for frame in frames] != [
-            len(frame.offset) for frame in self.frames
-        ]:
-            count = len(self.frames)
-            outputs = len(self.frames[0].offset)
-            raise ValueError(f"frames: {len(frames)} given, {count} over {outputs} outputs needed.")
+        _check_frames("frames", frames)
         return LocalKMP(self.primitives, tuple(frames))
 
     def predict(self, queries: ArrayLike) -> Gaussians:
@@ -336,8 +325,6 @@ class LocalKMP(Immutable, Plotted, Saved):
         it. `tolerance` [unit of the inputs] is that of `KMP.adapt`. Raises ValueError as that does.
         """
         via = numbers("inputs", inputs, "V", self.primitives[0].inputs.shape[1])
-        if tolerance is not None:
-            not_negative("tolerance", tolerance)
         if frame is not None:
             whole("frame", frame, least=0, most=len(self.frames) - 1)
         check_pairs("desired", via, desired, self.primitives[0].outputs)

@@ -127,12 +127,7 @@ class Gaussians(Immutable):
         shapes differ.
         """
         factors = (self, *others)
-        for other in others:
-            check_gaussians("product", other)
-            if other.mean.shape != self.mean.shape:
-                raise ValueError(
-                    f"product: means of shape {other.mean.shape} given, {self.mean.shape} needed."
-                )
+        check_alike("product", factors)
         precisions = [np.linalg.inv(factor.covariance) for factor in factors]
         covariance = symmetric(np.linalg.inv(np.sum(precisions, axis=0)))
         return Gaussians(fused_mean(covariance, precisions, factors), covariance)
@@ -173,6 +168,17 @@ def check_gaussians(name: str, value: object, outputs: int | None = None) -> Non
     check_kind(name, value, Gaussians, "Gaussians(mean (N, O), covariance (N, O, O))")
     if outputs is not None and isinstance(value, Gaussians) and value.outputs != outputs:
         raise ValueError(f"{name}: normals over {value.outputs} outputs given, {outputs} needed.")
+
+
+def check_alike(name: str, parts: Sequence[Gaussians]) -> None:
+    """Raise ValueError unless the parts are as many normals each, over the same outputs."""
+    for i, part in enumerate(parts):
+        check_gaussians(f"{name}[{i}]", part)
+        needed = parts[0].mean.shape
+        if part.mean.shape != needed:
+            raise ValueError(
+                f"{name}[{i}]: means of shape {part.mean.shape} given, {needed} needed."
+            )
 
 
 def check_pairs(name: str, inputs: Array, points: Gaussians, outputs: int) -> None:

@@ -14,7 +14,7 @@ from typing import Any, TypeVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from kmp.arrays.checks import brief, check_kind, check_shape, numbers, real
+from kmp.arrays.checks import brief, check_kind, check_shape, numbers, positive, real
 from kmp.arrays.immutable import frozen
 from kmp.composition import ProductKernel, SumKernel
 from kmp.constraints import LinearConstraints
@@ -215,8 +215,8 @@ def _base(arrays: Mapping[str, NDArray[Any]], kinds: Mapping[str, Any]) -> BaseS
         check_shape("prior_mean", prior, reference.outputs, 1 + inputs.shape[1])
     parameters = Hyperparameters.checked(
         _kernel(arrays, kinds),
-        float(numbers("lambda_mean", arrays["lambda_mean"])),
-        float(numbers("lambda_covariance", arrays["lambda_covariance"])),
+        positive("lambda_mean", arrays["lambda_mean"]),
+        positive("lambda_covariance", arrays["lambda_covariance"]),
         AffineMean(prior[:, 1:], prior[:, 0]) if prior.ndim == 2 else prior,
         arrays.get("prior_covariance"),
         inputs=inputs.shape[1],
@@ -288,14 +288,12 @@ def _kernel(arrays: Mapping[str, NDArray[Any]], kinds: Mapping[str, Any]) -> Ker
     if _KERNEL + KIND in arrays:
         return cast(Kernel, _value(arrays, _KERNEL, kinds))
     if "period" in arrays:
-        return PeriodicKernel(
-            float(numbers("ell", arrays["ell"])), float(numbers("period", arrays["period"]))
-        )
+        return PeriodicKernel(positive("ell", arrays["ell"]), positive("period", arrays["period"]))
     if "channels" not in arrays:
         return GaussianKernel(arrays["ell"])
-    if (channels := float(numbers("channels", arrays["channels"]))) != 2:
+    if (channels := positive("channels", arrays["channels"])) != 2:
         raise ValueError(f"channels: {channels:g} given, 2 needed where it is given.")
-    return VelocityKernel(float(numbers("ell", arrays["ell"])))
+    return VelocityKernel(positive("ell", arrays["ell"]))
 
 
 def _of_value(value: object, prefix: str) -> dict[str, NDArray[Any]]:

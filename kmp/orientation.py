@@ -15,7 +15,7 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kmp.arrays.checks import Array, Seed, check_finite, not_negative, numbers, real
+from kmp.arrays.checks import Array, Seed, check_finite, numbers, real
 from kmp.arrays.immutable import Immutable, frozen
 from kmp.arrays.linear_algebra import symmetric
 from kmp.gaussians import Gaussians, covariances, unchecked
@@ -277,8 +277,6 @@ class _Rotating(Immutable, Saved):
         of a rotation alone are exact, or if rates are given to a skill without.
         """
         where = numbers("inputs", inputs, "V", self.primitive.inputs.shape[1])
-        if tolerance is not None:
-            not_negative("tolerance", tolerance)
         size = self._size
         poses = numbers("desired", desired, len(where), size + 1)
         q = _unit("desired", poses[:, self._positions :])

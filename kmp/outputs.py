@@ -161,8 +161,8 @@ def _of_fixed(
     noise = normal.covariance[0][np.ix_(fixed, fixed)]
     least = _MIXED_EXACT * len(fixed) * prior[fixed]
     noise = noise + np.diag(np.maximum(least - variance[fixed], 0.0))
-    rest = np.sqrt(_MIXED_FREE * _prior_variances(parameters, point, np.eye(len(t)))[0])
-    null = rest[:, None] * (np.eye(len(t)) - back @ rows) * rest
+    free = np.sqrt(_MIXED_FREE * _prior_variances(parameters, point, np.eye(len(t)))[0])
+    null = free[:, None] * (np.eye(len(t)) - back @ rows) * free
     before = parameters.prior_at(point)[0]
     mean = before + back @ (normal.mean[0, fixed] - rows @ before)
     return mean, symmetric(back @ noise @ back.T + null)

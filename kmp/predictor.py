@@ -156,8 +156,8 @@ class Predictor(Immutable):
 
         The input's velocity v (I,) [unit of the inputs / s] and acceleration a (I,) [unit of the
         inputs / s^2] give those of the output: J v, and J a + d^2 xi(s + t v)/dt^2. The numbers are
-        those of `predict`, `jacobian` and `curvature`: bit for bit without Numba, to rounding with
-        it. The covariance takes longer than all else, and can be left out.
+        those of `jacobian` and `curvature`, and to rounding those of `predict`. The covariance
+        takes longer than all else, and can be left out.
 
         Raises ValueError if a shape differs or a number is not finite.
         """
@@ -178,15 +178,8 @@ class Predictor(Immutable):
         The derivative of equation (8). Raises ValueError if the shape differs or a number is not
         finite.
         """
-        s = real("query", query)
-        compiled = self.inner.compiled_query
-        if (
-            compiled is not None
-            and s.shape == (self._dimensions,)
-            and (jacobian := compiled.jacobian(s)) is not None
-        ):
-            return jacobian
-        return np.asarray(self.inner.query.jacobians(self._one_query(s)[None])[0])
+        still = np.zeros(self._dimensions)
+        return self.predict_motion(query, still, still, covariance=False).jacobian
 
     def jacobians(self, queries: ArrayLike) -> Array:
         """dxi/ds at queries (M, I): (M, O, I), equal to `jacobian` but for rounding.
@@ -204,9 +197,8 @@ class Predictor(Immutable):
         inputs / s], this is the output's acceleration [unit of the outputs / s^2] at constant v.
         Raises ValueError if a shape differs or a number is not finite.
         """
-        s = self._one_query(query)
         v = self._checked("direction", direction)
-        return self.inner.query.curvature(s, v)
+        return self.predict_motion(query, v, 0 * v, covariance=False).curvature
 
     def uncertainty(self, queries: ArrayLike) -> Uncertainty:
         """The covariance at queries (M, I), by its causes: differing demonstrations, distance.

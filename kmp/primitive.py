@@ -266,12 +266,8 @@ class KMP(Predictor, Plotted, Saved):
         Raises ValueError as `fit` and `adapt` do.
         """
         points = self.base.inner.solution.database.functionals
-        parameters = self.inner.solution.hyperparameters
         check_pairs("reference", points.inputs, reference, self.outputs)
-        database = Database(points, resolved(parameters, points, reference))
-        fitted = KMP(
-            Inner.of_base(solved(parameters, database, self.representation, RANK, TOLERANCE))
-        )
+        fitted = self._solved_anew(self._database(points, reference))
         return _combined(fitted, self.inner.changes, self._constraints)
 
     def extended(
@@ -291,14 +287,22 @@ class KMP(Predictor, Plotted, Saved):
         check_pairs("reference", added, reference, self.outputs)
         before = self._base_solution
         points = Functionals.checked(added, directions)
-        more = Database(points, resolved(before.hyperparameters, points, reference))
-        database = before.database.joined(more)
-        grown = (
-            before.extended(database)
-            if isinstance(before, Dense)
-            else solved(before.hyperparameters, database, self.representation, RANK, TOLERANCE)
+        database = before.database.joined(self._database(points, reference))
+        if isinstance(before, Dense):
+            grown = KMP(Inner.of_base(before.extended(database)))
+        else:
+            grown = self._solved_anew(database)
+        return _combined(grown, self.inner.changes, self._constraints)
+
+    def _database(self, points: Functionals, normals: Gaussians) -> Database:
+        return Database(points, resolved(self.inner.solution.hyperparameters, points, normals))
+
+    def _solved_anew(self, database: Database) -> KMP:
+        """The primitive of another database, with the same parameters."""
+        parameters = self.inner.solution.hyperparameters
+        return KMP(
+            Inner.of_base(solved(parameters, database, self.representation, RANK, TOLERANCE))
         )
-        return _combined(KMP(Inner.of_base(grown)), self.inner.changes, self._constraints)
 
     def _through(self, points: Functionals, desired: Gaussians, tolerance: float) -> KMP:
         """The primitive through these points. Warns if it misses one."""

@@ -10,17 +10,15 @@ The arrays that a query reads are prepared once. `kmp.loops.query` computes the 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 import numpy as np
 
 from kmp.arrays.checks import Array
-from kmp.arrays.immutable import Immutable, frozen
+from kmp.arrays.immutable import Immutable
 from kmp.arrays.linear_algebra import nearest_positive_semidefinite
 from kmp.functionals import Functionals
 from kmp.kernel import Kernel, between, third_derivative
-from kmp.radial import GaussianKernel
 from kmp.solution import Solution
 
 
@@ -86,40 +84,11 @@ class Query(Immutable):
     def jacobians(self, queries: Array) -> Array:
         """dxi/ds at queries (M, I): (M, O, I). Equation (8), derived."""
         count, inputs = queries.shape
-        functionals = self.solution.functionals
-        if type(self.kernel) is GaussianKernel and functionals.directions is None:
-            # -2 scale sum_r k_r w_r (x - x_r) is one product with w_r and w_r x_r. With the origin
-            # at the mean of the centres, the differences lose few digits.
-            scale, stretch = self.kernel.coordinates(inputs)
-            products = between(self.kernel, Functionals(queries), functionals) @ self._moments
-            x = queries * stretch - self._origin
-            pulls = products[:, : self.weights.shape[1], None]
-            moments = products[:, self.weights.shape[1] :].reshape(count, -1, inputs)
-            slopes = (pulls * x[:, None, :] - moments) * (-2 * scale * stretch)
-        else:
-            axes = np.tile(np.eye(inputs), (count, 1))
-            along = Functionals(np.repeat(queries, inputs, axis=0), axes)
-            products = between(self.kernel, along, functionals) @ self.weights
-            slopes = products.reshape(count, inputs, -1).transpose(0, 2, 1)
-        return slopes + self.prior_mean[:, 1:]
-
-    @cached_property
-    def _origin(self) -> Array:
-        """(I,) the mean of the centres, in the coordinates of a Gaussian kernel."""
-        return frozen(np.asarray(self._places.mean(axis=0)))
-
-    @cached_property
-    def _moments(self) -> Array:
-        """(R, O + O I) the weights w_r, and w_r (x_r - origin)."""
-        products = self.weights[:, :, None] * (self._places - self._origin)[:, None, :]
-        return frozen(np.hstack([self.weights, products.reshape(len(products), -1)]))
-
-    @property
-    def _places(self) -> Array:
-        """(R, I) the centres, in the coordinates of a Gaussian kernel."""
-        centres = self.solution.centres
-        _, stretch = cast(GaussianKernel, self.kernel).coordinates(centres.shape[1])
-        return centres * stretch
+        axes = np.tile(np.eye(inputs), (count, 1))
+        along = Functionals(np.repeat(queries, inputs, axis=0), axes)
+        products = between(self.kernel, along, self.solution.functionals) @ self.weights
+        slopes = products.reshape(count, inputs, -1).transpose(0, 2, 1)
+        return np.asarray(slopes + self.prior_mean[:, 1:])
 
     def curvature(self, query: Array, velocity: Array) -> Array:
         """d^2 xi(s + t v)/dt^2 (O,) at t = 0, for v (I,). Equation (8), derived twice."""

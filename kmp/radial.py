@@ -135,14 +135,14 @@ class RadialKernel(Composable):
         mixed = k[both]
         if mixed.size:
             across = 2 * scale * (v @ w.T)
-            mixed = self._derived(u[both], mixed, left[:, j] * right[i], across)
-        k[i] = self._derived(u[i], k[i], left)
-        k[:, j] = self._derived(u[:, j], k[:, j], right)
+            mixed = self._derived(u[both], left[:, j] * right[i], across)
+        k[i] = self._derived(u[i], left)
+        k[:, j] = self._derived(u[:, j], right)
         k[both] = mixed
         return k
 
-    def _derived(self, u: Array, k: Array, slope: Array, across: Array | None = None) -> Array:
-        """D_a k, by the slope -u_a; with -u_ab given, D_ab k by the slope u_a u_b. k is f(u)."""
+    def _derived(self, u: Array, slope: Array, across: Array | None = None) -> Array:
+        """D_a k, by the slope -u_a; with -u_ab given, D_ab k by the slope u_a u_b."""
         above_0 = np.maximum(u, _LEAST_U)
         if across is None:
             return -self.first_derivative(above_0) * slope
@@ -183,18 +183,6 @@ class GaussianKernel(RadialKernel):
         return self.profile(u)
 
     third_derivative = first_derivative
-
-    def _derived(self, u: Array, k: Array, slope: Array, across: Array | None = None) -> Array:
-        if type(self) is not GaussianKernel:
-            return super()._derived(u, k, slope, across)
-        return k * (slope if across is None else slope + across)
-
-    def variances(self, along: Array) -> Array:
-        if type(self) is not GaussianKernel:
-            return super().variances(along)
-        scale, stretch = self.coordinates(along.shape[1])
-        squares = 2 * scale * ((along * stretch) ** 2).sum(axis=1, keepdims=True)
-        return np.where(squares > 0, squares, 1.0)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

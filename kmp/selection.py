@@ -95,22 +95,20 @@ class Learned(Immutable):
 
     def report(self, count: int = 10) -> str:
         """The best `count` of the scores as a table, then what was chosen and its reach."""
-        lines = [f"{'ell':>40} {'lambda':>10} {'lambda_c':>10} {'RMSE':>10} {'-log lik.':>10}"]
+        lines = [_row("ell", "lambda", "lambda_c", "RMSE", "-log lik.")]
         for score in self.scores[: whole("count", count)]:
-            ell = " ".join(f"{value:.3g}" for value in np.atleast_1d(score.ell))
-            other = "" if score.lambda_covariance is None else f"{score.lambda_covariance:.3g}"
-            likelihood = (
-                ""
-                if score.negative_log_likelihood is None
-                else f"{score.negative_log_likelihood:.3f}"
-            )
             lines.append(
-                f"{ell:>40} {score.lambda_mean:>10.3g} {other:>10} {score.rmse:>10.4g} "
-                f"{likelihood:>10}"
+                _row(
+                    " ".join(f"{value:.3g}" for value in np.atleast_1d(score.ell)),
+                    f"{score.lambda_mean:.3g}",
+                    "" if score.lambda_covariance is None else f"{score.lambda_covariance:.3g}",
+                    f"{score.rmse:.4g}",
+                    ""
+                    if score.negative_log_likelihood is None
+                    else f"{score.negative_log_likelihood:.3f}",
+                )
             )
-        lines.append(
-            f"{'mixture regression alone':>40} {'':>10} {'':>10} {self.regression_rmse:>10.4g}"
-        )
+        lines.append(_row("mixture regression alone", "", "", f"{self.regression_rmse:.4g}"))
         kernel = self.primitive.kernel
         penalty = self.primitive.lambda_mean
         reach = " ".join(f"{distance:.3g}" for distance in self.reach)
@@ -118,6 +116,10 @@ class Learned(Immutable):
             f"chosen: {kernel!r}, lambda {penalty:.3g}; a via-point matters up to {reach} from it"
         )
         return "\n".join(lines)
+
+
+def _row(name: str, *cells: str) -> str:
+    return f"{name:>40}" + "".join(f" {cell:>10}" for cell in cells)
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from kmp.arrays.linear_algebra import nearest_positive_semidefinite
 from kmp.compiled import AVAILABLE, compiled
 from kmp.dense import Dense
 from kmp.loops.kernel_row import kernel_value
-from kmp.loops.mean import means, slopes, table_of
+from kmp.loops.mean import means, table_of
 from kmp.query import MotionPrediction, Query
 from kmp.radial import GaussianKernel
 
@@ -79,7 +79,7 @@ class CompiledQuery(Immutable):
 
     @cached_property
     def _reads(self) -> tuple[Array, NDArray[np.intp], Array, Array, Array]:
-        """The arguments of `means` and `slopes` other than the queries."""
+        """The arguments of `means` other than the queries."""
         coordinates = frozen(np.concatenate([[self.scale], self.stretch]))
         directions = frozen(self.along[self.places])
         return self.table, self.places, directions, coordinates, self.query.prior_mean
@@ -96,13 +96,6 @@ class CompiledQuery(Immutable):
         out = np.empty((len(query_array), len(prior)))
         finite = means(query_array, table, places, along, coordinates, prior, values, out)
         return (out, values[: len(self.rows)]) if finite else None
-
-    def jacobian(self, query: Array) -> Array | None:
-        """As `Query.jacobian`, to rounding; None as in `mean`."""
-        table, places, along, coordinates, prior = self._reads
-        query_array = np.array(query, np.float64, order="C")
-        out = np.empty((len(prior), len(query_array)))
-        return out if slopes(query_array, table, places, along, coordinates, prior, out) else None
 
     def motion(
         self, query: Array, velocity: Array, acceleration: Array, *, covariance: bool

@@ -78,9 +78,10 @@ class Database(Immutable):
 
     def exceeds(self, kernel: Kernel, share: float) -> bool:
         """True if all `least_shares` are above this one."""
-        own = share * self._variances(kernel)
+        least = share * self._variances(kernel)
+        identity = np.eye(self.reference.outputs)
         try:
-            np.linalg.cholesky(self.reference.covariance - own[:, :, None] * np.eye(own.shape[1]))
+            np.linalg.cholesky(self.reference.covariance - least[:, :, None] * identity)
         except np.linalg.LinAlgError:
             return False
         return True
