@@ -192,8 +192,8 @@ class Dense(Expansion):
             solution = Dense(self.hyperparameters, database, self, count - len(replaced), replaced)
             if solution.distinct >= self.distinct:
                 return solution
-        same = first if first >= _LEAST_SHARED * count else 0
-        return Dense(self.hyperparameters, database, self, same)
+        shared = first if first >= _LEAST_SHARED * count else 0
+        return Dense(self.hyperparameters, database, self, shared)
 
     def extended(self, database: Database) -> Dense:
         """The solution of a database that begins with this one: the factors get a border."""

@@ -7,8 +7,11 @@ below a share of N.
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
+from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from kmp.arrays.checks import RankReached
 from kmp.dense import SINGLE, Dense
@@ -24,6 +27,8 @@ from kmp.outputs import (
 from kmp.problem.database import Database
 from kmp.problem.hyperparameters import Hyperparameters
 from kmp.solution import Solution, is_resolved
+
+_Some = TypeVar("_Some", Dense, LowRank)
 
 _SMALL = 1500  # N O up to which finding the rank of several inputs costs more than it can save
 LARGE = 6000  # N O above which the dense solution takes seconds and 300 MB
@@ -57,9 +62,18 @@ def solved(
 def dense(parameters: Hyperparameters, database: Database) -> Dense | Decoupled:
     """The dense solution, of each group of outputs by itself where these decouple."""
     groups = decoupled_groups(parameters, database.reference, alike=True)
+    return _of_groups(parameters, database, groups, Dense)
+
+
+def _of_groups(
+    parameters: Hyperparameters,
+    database: Database,
+    groups: tuple[NDArray[np.intp], ...],
+    solution: Callable[[Hyperparameters, Database], _Some],
+) -> _Some | Decoupled:
     if len(groups) == 1:
-        return Dense(parameters, database)
-    return Decoupled.of_parts(parameters, database, groups, lambda p, d, _: Dense(p, d))
+        return solution(parameters, database)
+    return Decoupled.of_parts(parameters, database, groups, lambda p, d, _: solution(p, d))
 
 
 def _solved(
@@ -88,15 +102,8 @@ def _solved(
     if optional and not (enough and is_resolved(parameters, database)):
         return dense(parameters, database).solved()
     groups = decoupled_groups(parameters, database.reference, alike=False)
-    solution: LowRank | Decoupled = (
-        LowRank.fit(parameters, database, features, values=values)
-        if len(groups) == 1
-        else Decoupled.of_parts(
-            parameters,
-            database,
-            groups,
-            lambda p, d, _: LowRank.fit(p, d, features, values=values),
-        )
+    solution = _of_groups(
+        parameters, database, groups, lambda p, d: LowRank.fit(p, d, features, values=values)
     ).solved()
     if not enough:
         warnings.warn(

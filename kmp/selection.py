@@ -154,10 +154,10 @@ class _Recipe:
         """The regression of a mixture at inputs (N, I), in the units of the outputs."""
         dimensions = inputs.shape[1]
         output_unit = self.unit[dimensions:]
-        found = mixture.regress(inputs / self.unit[:dimensions])
+        regression = mixture.regress(inputs / self.unit[:dimensions])
         return Gaussians(
-            found.mean * output_unit,
-            found.covariance * np.multiply.outer(output_unit, output_unit),
+            regression.mean * output_unit,
+            regression.covariance * np.multiply.outer(output_unit, output_unit),
         )
 
     def reference(
@@ -220,13 +220,13 @@ class _Taught(NamedTuple):
         return [
             _Folds(
                 tuple(
-                    self._held_out(recipe.reference(training, mixture, shown), mixture, held_out)
+                    self._held_out(recipe.reference(training, mixture, option), mixture, held_out)
                     for training, mixture, held_out in zip(others, mixtures, self.data, strict=True)
                 ),
-                shown,
+                option,
                 recipe.channels,
             )
-            for shown in options
+            for option in options
         ]
 
     def _held_out(

@@ -59,10 +59,8 @@ def most_likely(
     lengths = {"each": len(first), "one": 1, "none": 0}[free]
 
     def parameters(x: Array) -> tuple[Kernel, float]:
-        ell = np.exp(first + x[:lengths]) if lengths else np.exp(first)
-        return with_ell(kernel, ell) if lengths else kernel, lambda_mean or float(
-            np.exp(penalty + x[lengths])
-        )
+        scaled = with_ell(kernel, np.exp(first + x[:lengths])) if lengths else kernel
+        return scaled, lambda_mean or float(np.exp(penalty + x[lengths]))
 
     def target(x: Array) -> float:
         likelihood = negative_log_likelihood(points, prior_mean, *parameters(x))
