@@ -168,8 +168,8 @@ class KMP(Predictor, Plotted, Saved):
         be moved again and again; others remain, see `without_via_points`. N of the covariance
         remains that of the base, so that the covariance far away does not change.
 
-        Points of a deviation of 0 (`Gaussians.of`) are met as exactly as rounding allows; beside free
-        outputs that `prior_covariance` or a common covariance couples to them, to about 1e-7.
+        Points of a deviation of 0 (`Gaussians.of`) are met as exactly as rounding allows, beside
+        free outputs that a covariance couples to them to about 1e-7.
 
         If a row of `directions` (V, I) [unit of the inputs] is not zero, the normal is that of the
         output's derivative along it [unit of the outputs], dxi/ds times the direction: a velocity
