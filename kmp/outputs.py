@@ -36,7 +36,7 @@ from kmp.solution import BaseSolution, Expansion, Solution
 _ONE_SHAPE = 1e-14  # differences between the shapes of covariances that are rounding
 # lambda Sigma / k(s, s) of free outputs, and of free and exact ones that a map mixes: a ratio that
 # leaves two digits of the exact one's
-_FREE_ABOVE = 1e8
+_FREE_SHARE = 1e8
 _MIXED_FREE = 1e4
 _MIXED_EXACT = 1e-10
 
@@ -130,7 +130,7 @@ def mixes(
     that rounding hides the small ones in the coordinates x.
     """
     variances = np.diagonal(normals.covariance, axis1=1, axis2=2)
-    is_free = variances > _FREE_ABOVE * _prior_variances(parameters, points, t)
+    is_free = variances > _FREE_SHARE * _prior_variances(parameters, points, t)
     kinds = np.stack([is_free, normals.exact, ~(is_free | normals.exact)])  # (3, N, O)
     enters = kinds @ (np.linalg.inv(t) != 0).T  # each kind in each x
     return np.asarray((enters.sum(axis=0) > 1).any(axis=1))
@@ -154,7 +154,7 @@ def _of_fixed(
     """
     prior = _prior_variances(parameters, point, t)[0]
     variance = np.diagonal(normal.covariance[0])
-    fixed = np.flatnonzero(variance <= _FREE_ABOVE * prior)
+    fixed = np.flatnonzero(variance <= _FREE_SHARE * prior)
     rows = t[fixed]
     sizes = np.linalg.norm(rows, axis=1)
     back = np.linalg.pinv(rows / sizes[:, None]) / sizes

@@ -71,8 +71,8 @@ def test_any_sizes_of_outputs_are_allowed():
     """Correlations decide whether a covariance is positive definite."""
     sizes = np.array([1e9, 1.0, 1e-9])
     covariance = np.outer(sizes, sizes) * (np.eye(3) + 0.5)
-    found = Gaussians(np.zeros((1, 3)), covariance[None]).covariance[0]
-    np.testing.assert_array_equal(found, covariance)
+    checked = Gaussians(np.zeros((1, 3)), covariance[None]).covariance[0]
+    np.testing.assert_array_equal(checked, covariance)
 
 
 @properties

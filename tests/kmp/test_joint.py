@@ -88,9 +88,9 @@ def test_small_outputs_scale(size):
         spread = skill.sample(queries, 400).std(axis=0)
         return [variance / prior for variance in variances], spread / unit
 
-    (expected, spread), (found, found_spread) = scaled(np.ones(2)), scaled(np.array(size))
-    np.testing.assert_allclose(found, expected, atol=1e-9)
-    np.testing.assert_allclose(found_spread, spread, rtol=0.2)
+    (expected, spread), (variances, scaled_spread) = scaled(np.ones(2)), scaled(np.array(size))
+    np.testing.assert_allclose(variances, expected, atol=1e-9)
+    np.testing.assert_allclose(scaled_spread, spread, rtol=0.2)
 
 
 @pytest.mark.parametrize("representation", ["dense", "low_rank"])

@@ -142,8 +142,8 @@ def test_via_point_is_on_the_present_branch():
     present = inner.mean([0.9])
     assert np.linalg.norm(present) > np.pi
     for sign in (1, -1):
-        kept = winding.adapt([0.9], sign * winding.mean([0.9]), np.zeros((3, 3)))
-        np.testing.assert_allclose(kept.primitive.mean([0.9]), present, atol=1e-8)
+        adapted = winding.adapt([0.9], sign * winding.mean([0.9]), np.zeros((3, 3)))
+        np.testing.assert_allclose(adapted.primitive.mean([0.9]), present, atol=1e-8)
 
 
 @pytest.mark.parametrize("exact", [1, 2])

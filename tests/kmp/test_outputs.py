@@ -160,8 +160,8 @@ def test_exact_and_free_outputs_of_one_point(exact, prior, representation):
     joint = primitive.predict_joint(np.vstack([point, QUERIES]))
     gain = joint.covariance[0][:, exact] / joint.covariance[0][exact, exact]
     expected = (joint.mean[0] + 0.3 * gain).reshape(-1, 3)
-    for given in (desired, desired + 7 * (deviation > 0)):
-        adapted = primitive.adapt(point, Gaussians.of(given, deviation=deviation), tolerance=0.0)
+    for means in (desired, desired + 7 * (deviation > 0)):
+        adapted = primitive.adapt(point, Gaussians.of(means, deviation=deviation), tolerance=0.0)
         assert adapted.mean(point)[0, exact] == pytest.approx(desired[0, exact], abs=1e-6)
         assert_close(adapted.mean(QUERIES), expected[1:], 1e-4)
         variance = adapted.predict(point).covariance[0, exact, exact]

@@ -97,8 +97,8 @@ def test_exact_and_free_outputs_in_turned_frame(deviation, degrees):
     before = skill.mean([0.5])[0]
     adapted = skill.adapt([0.5], Gaussians.of(before + 0.1, deviation=deviation), tolerance=0.0)
     moved = adapted.mean([0.5])[0] - before
-    for move, given in zip(moved, deviation, strict=True):
-        if given == 0:
+    for move, spread in zip(moved, deviation, strict=True):
+        if spread == 0:
             assert move == pytest.approx(0.1, abs=1e-6)
 
 
