@@ -136,6 +136,8 @@ class Hyperparameters(Immutable):
 
     def prior_at(self, points: Functionals) -> Array:
         """The prior mean (N, O) of N functionals. A derivative along v has A v."""
+        if points.directions is None:
+            return np.asarray(points.inputs @ self.prior_matrix.T + self.prior_offset)
         values = points.values[:, None]
         moved = np.where(values, points.inputs, points.along)
         return np.asarray(moved @ self.prior_matrix.T + values * self.prior_offset)
