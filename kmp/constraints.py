@@ -12,14 +12,13 @@ from functools import cached_property
 from typing import ClassVar, Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kmp.arrays.checks import Array, check_kind, numbers
 from kmp.arrays.immutable import Immutable, frozen
 from kmp.dense import Dense
 from kmp.functionals import Functionals
 from kmp.kernel import between
-from kmp.problem.database import Changes, Database
+from kmp.problem.database import Database
 from kmp.problem.hyperparameters import Hyperparameters
 from kmp.solution import Expansion, mean_of
 
@@ -153,15 +152,6 @@ class Constrained(Expansion):
 
     def posterior_covariance(self, rows: Array) -> Array:
         return self.solution.posterior_covariance(self._known(rows))
-
-    def adapted(self, changes: Changes) -> Constrained:
-        return Constrained(self.solution.adapted(changes), self.constraints)
-
-    def with_hyperparameters(self, hyperparameters: Hyperparameters) -> Constrained:
-        return Constrained(self.solution.with_hyperparameters(hyperparameters), self.constraints)
-
-    def to_arrays(self) -> dict[str, NDArray[np.float64]]:
-        return self.solution.to_arrays()
 
     def _known(self, rows: Array) -> Array:
         return np.asarray(rows[..., : len(self.database) * self.hyperparameters.kernel.channels])

@@ -35,7 +35,6 @@ _LEAST_SHARED = 0.75
 _MOST_REMOVED = 0.125  # removing points is faster than a fit up to this share of them
 # least lambda_c Sigma / k(s, s) from which a product with the inverse is exact to 1e-9
 _PRECISE = 1e-2
-_COLUMNS = 64  # columns of a factor that are copied at once
 
 
 class _Removed(NamedTuple):
@@ -100,15 +99,9 @@ class _Bordered(NamedTuple):
 
     def whole(self) -> Array:
         """The factor as one array (p + m, p + m)."""
-        p = len(self.base)
-        n = sum(self.border.shape)
-        factor = np.zeros((n, n), order="F")  # LAPACK's order: each use would copy another
-        # pages above the diagonal are not written, and take no memory
-        for a in range(0, p, _COLUMNS):
-            factor[a:p, a : min(a + _COLUMNS, p)] = self.base[a:, a : min(a + _COLUMNS, p)]
-        factor[p:, :p] = self.border.T
-        factor[p:, p:] = self.corner
-        return frozen(factor)
+        above = np.zeros(self.border.shape)
+        factor = np.block([[self.base, above], [self.border.T, self.corner]])
+        return frozen(np.asfortranarray(factor))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -188,21 +181,19 @@ class Dense(Expansion):
         )
 
     def adapted(self, changes: Changes) -> Dense:
-        """The base's solution with these changes; it shares the base's factor if that is faster."""
-        base = self.base or self
-        count = len(base.database)
+        """The solution with these changes; it shares this one's factor if that is faster."""
+        count = len(self.database)
         replaced = changes.replaced
-        database = base.database.changed(changes)
+        database = self.database.changed(changes)
         first = int(replaced[0]) if len(replaced) else count
-        if len(replaced) and base.database.reference.mean.size <= SINGLE:
-            return Dense(self.hyperparameters, database, base)  # a fit takes less than a change
+        if len(replaced) and self.database.reference.mean.size <= SINGLE:
+            return Dense(self.hyperparameters, database, self)  # a fit takes less than a change
         if count - first > 2 * len(replaced) and len(replaced) <= _MOST_REMOVED * count:
-            solution = Dense(self.hyperparameters, database, base, count - len(replaced), replaced)
-            if solution.distinct >= base.distinct:
+            solution = Dense(self.hyperparameters, database, self, count - len(replaced), replaced)
+            if solution.distinct >= self.distinct:
                 return solution
-        return Dense(
-            self.hyperparameters, database, base, first if first >= _LEAST_SHARED * count else 0
-        )
+        shared = first if first >= _LEAST_SHARED * count else 0
+        return Dense(self.hyperparameters, database, self, shared)
 
     def extended(self, database: Database) -> Dense:
         """The solution of a database that begins with this one: the factors get a border."""
@@ -225,6 +216,8 @@ class Dense(Expansion):
         c = self.hyperparameters.kernel.channels
         d = self.hyperparameters.channel_outputs
         covariance = self.database.reference.covariance
+        if covariance[0, 0, 1:d].any():
+            return d
         first = covariance.reshape(-1, c, d, c, d)[:, :, 0, :, 0]
         return 1 if np.array_equal(covariance, kron_identity(first, d)) else d
 
@@ -248,8 +241,8 @@ class Dense(Expansion):
         """
         parameters = self.hyperparameters
         kernel = parameters.kernel
-        share = parameters.lambda_covariance * self.database.least_shares(kernel).min()
-        if kernel.channels > 1 or share < _PRECISE:
+        precise = _PRECISE / parameters.lambda_covariance
+        if kernel.channels > 1 or not self.database.exceeds(kernel, precise):
             return None
         lower, _ = lapack.dpotri(self.covariance_factor, lower=1)
         inverse = np.tril(lower) + np.tril(lower, -1).T
@@ -287,12 +280,17 @@ class Dense(Expansion):
     @cached_property
     def _covariance_solver(self) -> Array | _Bordered:
         parameters = self.hyperparameters
-        check_resolved(parameters, self.database.since(self.same), first=self.same)
+        check_resolved(parameters, self._added, first=self.same)
         if parameters.lambda_covariance == parameters.lambda_mean:
             return self._mean_solver
         return self._factorised(
             parameters.lambda_covariance, self.base.covariance_factor if self.base else None
         )
+
+    @property
+    def _added(self) -> Database:
+        """The points whose factor the base does not share."""
+        return self.database.take(slice(self.same, None)) if self.same else self.database
 
     def _factorised(self, penalty: float, base_factor: Array | None) -> Array | _Bordered:
         """The Cholesky factor with this lambda, bordering the base's if that is shared."""
@@ -352,15 +350,15 @@ class Dense(Expansion):
         o = c * d
         points = self.database.functionals
         count = len(self.database)
-        changed = len(self.database) - first
+        changed = count - first
         rows = np.zeros((changed, c, d, count, c, d))
-        k = between(kernel, points.take(slice(first, None)), points).reshape(changed, c, count, c)
+        k = between(kernel, self._added.functionals, points).reshape(changed, c, count, c)
         for i in range(d):
             rows[:, :, i, :, :, i] = k
-        diagonal = np.arange(changed)
-        blocks = rows.reshape(changed, o, count, o)
+        blocks = rows.reshape(changed, o, count, o)[:, :, first:]
         covariance = self.database.reference.covariance[first:].reshape(
             changed, c, outputs, c, outputs
         )[:, :, :d, :, :d]
-        blocks[diagonal, :, diagonal + first, :] += penalty * covariance.reshape(changed, o, o)
+        diagonal = np.einsum("ninj->nij", blocks)  # a view
+        diagonal += penalty * covariance.reshape(changed, o, o)
         return rows.reshape(changed * o, count * o)

@@ -17,25 +17,25 @@ from kmp.arrays.checks import (
     Seed,
     brief,
     check_some,
-    not_negative,
+    checked_demonstrations,
     numbers,
-    pair,
     parts_of,
     whole,
 )
 from kmp.arrays.immutable import Immutable, frozen
 from kmp.arrays.linear_algebra import symmetric
-from kmp.gaussians import Gaussians, check_gaussians, check_pairs
+from kmp.functionals import Functionals
+from kmp.gaussians import Gaussians, check_gaussians, check_pairs, unchecked
 from kmp.kernel import Kernel, checked_kernel
 from kmp.mixture import GaussianMixture
+from kmp.outputs import inside, mixes
 from kmp.plot import Plotted, Points, Shown
 from kmp.predictor import Uncertainty, drawn_paths
 from kmp.primitive import KMP, Saved, checked_primitive
 from kmp.query import MotionPrediction
 
-_DIFFERENCE = (
-    3e-3  # of differences, over the kernel's length: error of fourth order and rounding balance
-)
+# step of differences over the kernel's length: slopes are best here, curvatures have 6 digits
+_DIFFERENCE = 1e-3
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -104,6 +104,18 @@ class CoordinateFrame(Immutable):
         return normals.affine(self.matrix, self.offset)
 
 
+def _localised(
+    frame: CoordinateFrame, primitive: KMP, inputs: Array, desired: Gaussians
+) -> Gaussians:
+    """Via-points (V, I) of the world in a frame, whose primitive this is."""
+    parameters = primitive.inner.solution.hyperparameters
+    points = Functionals(inputs)
+    shifted = unchecked(desired.mean - frame.offset, desired.covariance)
+    if mixes(parameters, points, frame.matrix, shifted).any():
+        return inside(parameters, points, frame.matrix, shifted)
+    return frame.localised(desired)
+
+
 def _check_frames(name: str, frames: Sequence[CoordinateFrame]) -> int:
     """The number of frames. Raises ValueError unless all are frames."""
     return len(parts_of(name, frames, CoordinateFrame, "CoordinateFrame(matrix, offset)"))
@@ -156,26 +168,21 @@ class LocalKMP(Immutable, Plotted, Saved):
         Raises ValueError if a demonstration does not have F frames, and as these two do.
         """
         kernel = checked_kernel(kernel)
-        parts_of("demonstrations", demonstrations)
+        data = checked_demonstrations(demonstrations)
         counts = [
             _check_frames(f"frames[{h}]", frame_set)
             for h, frame_set in enumerate(parts_of("frames", frames))
         ]
-        if len(counts) != len(demonstrations) or len(set(counts)) != 1:
-            count = len(demonstrations)
+        if len(counts) != len(data) or len(set(counts)) != 1:
             raise ValueError(
-                f"frames: {brief(counts)} given for {count} demonstrations, as many for each "
+                f"frames: {brief(counts)} given for {len(data)} demonstrations, as many for each "
                 "needed."
             )
-        where = numbers("inputs", inputs, "N", "I")
-        data = [
-            pair(f"demonstrations[{h}]", demonstration)
-            for h, demonstration in enumerate(demonstrations)
-        ]
+        where = numbers("inputs", inputs, "N", data[0][0].shape[1])
         primitives = []
         for f in range(counts[0]):
             samples = [
-                np.hstack([numbers("inputs", s, "T", where.shape[1]), frame[f].local(xi)])
+                np.hstack([s, frame[f].local(xi)])
                 for (s, xi), frame in zip(data, frames, strict=True)
             ]
             mixture = GaussianMixture.fit(
@@ -200,12 +207,7 @@ class LocalKMP(Immutable, Plotted, Saved):
 
     def placed(self, frames: Sequence[CoordinateFrame]) -> LocalKMP:
         """The skill with its F frames moved. Raises ValueError if F or O differs."""
-        if _check_frames("frames", frames) and [len(frame.offset) for frame in frames] != [
-            len(frame.offset) for frame in self.frames
-        ]:
-            count = len(self.frames)
-            outputs = len(self.frames[0].offset)
-            raise ValueError(f"frames: {len(frames)} given, {count} over {outputs} outputs needed.")
+        _check_frames("frames", frames)
         return LocalKMP(self.primitives, tuple(frames))
 
     def predict(self, queries: ArrayLike) -> Gaussians:
@@ -222,7 +224,7 @@ class LocalKMP(Immutable, Plotted, Saved):
         return self.predict(queries).mean
 
     def jacobian(self, query: ArrayLike) -> Array:
-        """d mean / ds (O, I) at one query (I,), by differences, to some 1e-9 of its size.
+        """d mean / ds (O, I) at one query (I,), by differences, to some 1e-8 of its size.
 
         Raises ValueError as `KMP.jacobian` does.
         """
@@ -240,7 +242,8 @@ class LocalKMP(Immutable, Plotted, Saved):
     ) -> MotionPrediction:
         """The output at one query (I,) and its motion with the input, as `KMP.predict_motion`.
 
-        By differences, to some 1e-9 of their sizes. Raises ValueError as that does.
+        By differences: velocities to some 1e-8 of their sizes, accelerations to 1e-6. Raises
+        ValueError as that does.
         """
         s = self._checked("query", query)
         v = self._checked("velocity", velocity)
@@ -255,11 +258,11 @@ class LocalKMP(Immutable, Plotted, Saved):
 
     def _differences(self, query: Array, velocity: Array) -> tuple[Array, Array, Array]:
         """Mean and its two derivatives (O,) along a line through the query, of fourth order."""
-        speed = float(np.linalg.norm(velocity))
         mean = self.mean(query[None])[0]
-        if speed == 0.0:
+        speeds = [np.linalg.norm(np.sqrt(p.kernel.ell) * velocity) for p in self.primitives]
+        if max(speeds) == 0.0:
             return mean, 0.0 * mean, 0.0 * mean
-        step = _DIFFERENCE / (speed * np.sqrt(np.max(self.primitives[0].kernel.ell)))
+        step = _DIFFERENCE / max(speeds)
         first, second, third, fourth = self.mean(
             query + step * np.array([-2.0, -1.0, 1.0, 2.0])[:, None] * velocity
         )
@@ -270,7 +273,8 @@ class LocalKMP(Immutable, Plotted, Saved):
     def sample(self, queries: ArrayLike, count: int, *, seed: Seed = 0) -> Array:
         """Paths (count, M, O) through queries (M, I), of the product of the frames' joint normals.
 
-        Raises ValueError as `KMP.sample` does.
+        Their mean is not `mean`: that is of a product for each query by itself, and here the
+        correlations between queries count, too. Raises ValueError as `KMP.sample` does.
         """
         whole("count", count)
         joint = [primitive.predict_joint(queries) for primitive in self.primitives]
@@ -288,7 +292,9 @@ class LocalKMP(Immutable, Plotted, Saved):
             gain = np.linalg.lstsq(covariance + spread, covariance, rcond=1e-14)[0].T
             mean = mean + gain @ (other - mean)
             covariance = symmetric(covariance - gain @ covariance)
-        return drawn_paths(mean, covariance, count, seed).reshape(count, points, outputs)
+        product = unchecked(mean[None], covariance[None])
+        drawn = drawn_paths(product, np.ones(len(mean)), count, seed)
+        return drawn.reshape(count, points, outputs)
 
     def uncertainty(self, queries: ArrayLike) -> Uncertainty:
         """The covariance of `predict`, by its causes, of which each frame's share counts as in the
@@ -319,20 +325,14 @@ class LocalKMP(Immutable, Plotted, Saved):
         it. `tolerance` [unit of the inputs] is that of `KMP.adapt`. Raises ValueError as that does.
         """
         via = numbers("inputs", inputs, "V", self.primitives[0].inputs.shape[1])
-        if tolerance is not None:
-            not_negative("tolerance", tolerance)
         if frame is not None:
             whole("frame", frame, least=0, most=len(self.frames) - 1)
         check_pairs("desired", via, desired, self.primitives[0].outputs)
-        adapted = tuple(
-            primitive.adapt(via, where.localised(desired), tolerance=tolerance)
-            if frame in (None, number)
-            else primitive
-            for number, (where, primitive) in enumerate(
-                zip(self.frames, self.primitives, strict=True)
-            )
-        )
-        return LocalKMP(adapted, self.frames)
+        adapted = list(self.primitives)
+        for n in range(len(adapted)) if frame is None else [frame]:
+            local = _localised(self.frames[n], adapted[n], via, desired)
+            adapted[n] = adapted[n].adapt(via, local, tolerance=tolerance)
+        return LocalKMP(tuple(adapted), self.frames)
 
     def _to_plot(self) -> Shown:
         """The references of all frames and the via-points, in the world's coordinates."""

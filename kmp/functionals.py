@@ -5,20 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kmp.arrays.checks import Array, numbers
 from kmp.arrays.immutable import Immutable, frozen
-
-
-class Derivatives(NamedTuple):
-    """The functionals that are derivatives, among R, and their directions."""
-
-    rows: NDArray[np.intp]  # (R',) their indices, ascending
-    along: Array  # (R', I) their directions, in the kernel's coordinates
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -70,14 +63,3 @@ class Functionals(Immutable):
         if self.directions is None:
             return frozen(np.ones(len(self), dtype=bool))
         return frozen(np.asarray(~self.directions.any(axis=1)))
-
-    def derivatives(self, stretch: Array) -> Derivatives | None:
-        """The derivatives among them, in coordinates x = stretch * s; None if there is none."""
-        if self.directions is None:
-            return None
-        rows = np.flatnonzero(~self.values)
-        return (
-            Derivatives(frozen(rows), frozen(self.directions[rows] * stretch))
-            if len(rows)
-            else None
-        )

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kmp.arrays.checks import Array, brief, check_finite, check_kind, numbers, parts_of, real
+from kmp.arrays.checks import Array, check_finite, check_kind, numbers, parts_of, real
 from kmp.arrays.immutable import Immutable, frozen
 from kmp.arrays.linear_algebra import symmetric
 
@@ -79,6 +79,12 @@ class Gaussians(Immutable):
         """(N, O) true where an output is free: its deviation in `of` was infinite."""
         return np.asarray(np.diagonal(self.covariance, axis1=1, axis2=2) > _FREE_ABOVE)
 
+    @property
+    def has_limits(self) -> bool:
+        """True if an output is exact or free."""
+        variances = np.diagonal(self.covariance, axis1=1, axis2=2)
+        return bool(((variances < _EXACT_BELOW) | (variances > _FREE_ABOVE)).any())
+
     def __len__(self) -> int:
         return len(self.mean)
 
@@ -121,12 +127,7 @@ class Gaussians(Immutable):
         shapes differ.
         """
         factors = (self, *others)
-        for other in others:
-            check_gaussians("product", other)
-            if other.mean.shape != self.mean.shape:
-                raise ValueError(
-                    f"product: means of shape {other.mean.shape} given, {self.mean.shape} needed."
-                )
+        check_alike("product", factors)
         precisions = [np.linalg.inv(factor.covariance) for factor in factors]
         covariance = symmetric(np.linalg.inv(np.sum(precisions, axis=0)))
         return Gaussians(fused_mean(covariance, precisions, factors), covariance)
@@ -169,6 +170,17 @@ def check_gaussians(name: str, value: object, outputs: int | None = None) -> Non
         raise ValueError(f"{name}: normals over {value.outputs} outputs given, {outputs} needed.")
 
 
+def check_alike(name: str, parts: Sequence[Gaussians]) -> None:
+    """Raise ValueError unless the parts are as many normals each, over the same outputs."""
+    for i, part in enumerate(parts):
+        check_gaussians(f"{name}[{i}]", part)
+        needed = parts[0].mean.shape
+        if part.mean.shape != needed:
+            raise ValueError(
+                f"{name}[{i}]: means of shape {part.mean.shape} given, {needed} needed."
+            )
+
+
 def check_pairs(name: str, inputs: Array, points: Gaussians, outputs: int) -> None:
     """Raise ValueError unless each input (N, I) has one normal, over this number of outputs."""
     check_gaussians(name, points)
@@ -184,25 +196,29 @@ def covariances(name: str, value: ArrayLike, count: int, outputs: int) -> Array:
     if covariance.size == 0:
         return covariance
     size = np.abs(covariance).max(axis=(1, 2))
-    lopsided = np.abs(covariance - covariance.swapaxes(1, 2)).max(axis=(1, 2))
+    lopsided = np.abs(covariance - covariance.mT).max(axis=(1, 2))
     for n in np.flatnonzero(lopsided > _SYMMETRIC * size)[:1]:
         fault = f"is not symmetric: it differs from its transpose by up to {lopsided[n]:.3g}"
         raise ValueError(f"{name}[{n}] {fault}. Give (C + C^T) / 2 if that is what is meant.")
-    variances = np.diagonal(covariance, axis1=1, axis2=2)
-    alone = np.count_nonzero(covariance, axis=2) == 1
-    # exact outputs of `Gaussians.of`, beside others that are not
-    exact = alone & (variances > 0) & (variances < _EXACT_BELOW)
-    filled = covariance + np.where(exact, size[:, None], 0.0)[:, :, None] * np.eye(outputs)
-    try:
-        smallest = np.linalg.eigvalsh(filled)[:, 0]
-    except np.linalg.LinAlgError:
+    covariance = symmetric(covariance)
+    for n in np.flatnonzero(~_is_definite(covariance))[:1]:
+        smallest = np.linalg.eigvalsh(covariance[n])[0]
         raise ValueError(
-            f"{name}: {brief(value)} given, and its eigenvalues cannot be found."
-        ) from None
-    for n in np.flatnonzero(smallest <= covariance.shape[1] * _MACHINE * size)[:1]:
-        raise ValueError(
-            f"{name}[{n}] is not positive definite: its smallest eigenvalue is {smallest[n]:.3g}, "
+            f"{name}[{n}] is not positive definite: its smallest eigenvalue is {smallest:.3g}, "
             "and must be above 0. Add a small variance to the diagonal: (deviation that may be "
             "ignored)^2."
         )
-    return frozen(symmetric(covariance))
+    return frozen(covariance)
+
+
+def _is_definite(covariance: Array) -> NDArray[np.bool_]:
+    """(N,) true where the correlations are positive definite, whatever the outputs' sizes."""
+    variances = np.diagonal(covariance, axis1=1, axis2=2)
+    deviations = np.sqrt(np.where(variances > 0, variances, 1.0))
+    correlation = covariance / deviations[:, :, None] / deviations[:, None, :]
+    rounding = covariance.shape[1] * _MACHINE
+    try:
+        np.linalg.cholesky(correlation - rounding * np.eye(covariance.shape[1]))
+    except np.linalg.LinAlgError:
+        return np.asarray(np.linalg.eigvalsh(correlation)[:, 0] > rounding)
+    return np.ones(len(covariance), dtype=bool)

@@ -72,7 +72,7 @@ def checked_kernel(kernel: Kernel) -> Kernel:
 
 
 def third_derivative(kernel: Any, offsets: Array, along: Array, direction: Array) -> Array:
-    """The derivative (R,) of k by s, once along (R, I) and twice along one direction (I,).
+    """The derivatives (R, C, C) of k by s, once along (R, I) and twice along one direction (I,).
 
     `offsets` (R, I) are s - s'. Raises ValueError if the kernel has no such derivative.
     """
@@ -81,7 +81,8 @@ def third_derivative(kernel: Any, offsets: Array, along: Array, direction: Array
             f"kernel: {brief(kernel)} has no `third`, which curvatures need where "
             "derivatives are observed."
         )
-    return np.asarray(kernel.third(offsets, along, direction))
+    third = np.asarray(kernel.third(offsets, along, direction))
+    return third.reshape(-1, kernel.channels, kernel.channels)
 
 
 def between(kernel: Kernel, a: Functionals, b: Functionals) -> Array:

@@ -12,7 +12,7 @@ from functools import cache
 from typing import Any, TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from kmp.arrays.checks import (
     Array,
@@ -31,6 +31,7 @@ from kmp.gaussians import Gaussians, covariances
 
 _TOLERANCE = 1e-5  # change of the mean log-likelihood [nat] at which EM stops
 _ITERATIONS = 1000  # EM stops after this many steps
+_CONSTANT = 1e-12  # a deviation of this share of the largest number is rounding
 _NO_SAMPLES = 1e-15  # added to the number of samples of a component, which may be 0
 
 _Parts: TypeAlias = tuple[Array, Array, Array]
@@ -170,7 +171,12 @@ def mixture_of(
 def deviations(columns: Array) -> Array:
     """The deviation of each column; 1 of one that never changes."""
     deviation = columns.std(axis=0)
-    return np.where(deviation > 0, deviation, 1.0)
+    return np.where(varies(columns), deviation, 1.0)
+
+
+def varies(columns: Array) -> NDArray[np.bool_]:
+    """True for each column that changes, by more than rounding."""
+    return np.asarray(columns.std(axis=0) > _CONSTANT * np.abs(columns).max(axis=0))
 
 
 def one_thread() -> AbstractContextManager[Any]:

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kmp.arrays.checks import brief, check_kind, check_shape, numbers, real
+from kmp.arrays.checks import brief, check_kind, check_shape, numbers, positive, real
 from kmp.arrays.immutable import frozen
 from kmp.composition import ProductKernel, SumKernel
 from kmp.constraints import LinearConstraints
@@ -43,7 +43,7 @@ from kmp.query import MotionPrediction
 from kmp.radial import GaussianKernel, Matern32, Matern52
 from kmp.representation import dense
 from kmp.selection import Learned, Score
-from kmp.solution import Solution
+from kmp.solution import BaseSolution, Solution
 from kmp.time_kernels import PeriodicKernel, VelocityKernel
 
 _NAMES = (
@@ -64,6 +64,7 @@ _KERNEL = "kernel."  # begin of the names of a kernel's arrays, if `_BY_ELL` lac
 _OF_CONSTRAINTS = ("constraint_inputs", "constraint_normals", "constraint_bounds")
 _OF_LOW_RANK = ("pivots", "information", "features")
 KIND = "kind"
+_Some = TypeVar("_Some", bound=Solution)
 _KINDS: dict[str, Any] = {
     kind.__name__: kind
     for kind in (
@@ -121,7 +122,7 @@ def from_arrays(
 
 
 def _of_primitive(primitive: KMP) -> dict[str, NDArray[Any]]:
-    base = primitive.base.inner.solution
+    base = cast(BaseSolution, primitive.base.inner.solution)
     changes = primitive.inner.changes
     solution = primitive.inner.solution
     parameters = base.hyperparameters
@@ -141,9 +142,9 @@ def _of_primitive(primitive: KMP) -> dict[str, NDArray[Any]]:
         **kernel_arrays,
         "lambda_mean": np.array(parameters.lambda_mean),
         "lambda_covariance": np.array(parameters.lambda_covariance),
-        "prior_mean": parameters.prior_offset
-        if parameters.prior_matrix is None
-        else parameters.prior_columns,
+        "prior_mean": parameters.prior_columns
+        if parameters.prior_matrix.any()
+        else parameters.prior_offset,
     }
     if by_ell and kernel.period is not None:
         arrays["period"] = np.array(kernel.period)
@@ -176,7 +177,9 @@ def _primitive(arrays: Mapping[str, NDArray[Any]], kinds: Mapping[str, Any]) -> 
     has_constraints = any(name in arrays for name in _OF_CONSTRAINTS)
     if has_constraints and base.representation == "dense":
         base = _weighted(as_one(base), "base_weights", arrays)
-    solution = base.adapted(changes) if len(changes.inputs) else base
+    solution: Solution = base
+    if len(changes.inputs):
+        solution = base.adapted(changes)
     if has_constraints:
         solution = _constrained(solution, arrays)
     unadapted = KMP(Inner.of_base(base))
@@ -203,7 +206,7 @@ def _constrained(solution: Solution, arrays: Mapping[str, NDArray[Any]]) -> Solu
     return constrained(solution, constraints)
 
 
-def _base(arrays: Mapping[str, NDArray[Any]], kinds: Mapping[str, Any]) -> Solution:
+def _base(arrays: Mapping[str, NDArray[Any]], kinds: Mapping[str, Any]) -> BaseSolution:
     inputs = numbers("base_inputs", arrays["base_inputs"], "N", "I")
     reference = _normals("base", arrays)
     check_pairs("base_mean", inputs, reference, reference.outputs)
@@ -212,8 +215,8 @@ def _base(arrays: Mapping[str, NDArray[Any]], kinds: Mapping[str, Any]) -> Solut
         check_shape("prior_mean", prior, reference.outputs, 1 + inputs.shape[1])
     parameters = Hyperparameters.checked(
         _kernel(arrays, kinds),
-        float(numbers("lambda_mean", arrays["lambda_mean"])),
-        float(numbers("lambda_covariance", arrays["lambda_covariance"])),
+        positive("lambda_mean", arrays["lambda_mean"]),
+        positive("lambda_covariance", arrays["lambda_covariance"]),
         AffineMean(prior[:, 1:], prior[:, 0]) if prior.ndim == 2 else prior,
         arrays.get("prior_covariance"),
         inputs=inputs.shape[1],
@@ -224,12 +227,12 @@ def _base(arrays: Mapping[str, NDArray[Any]], kinds: Mapping[str, Any]) -> Solut
         return _weighted(_plain(parameters, database, arrays), "base_weights", arrays)
     t = numbers("output_map", arrays["output_map"], reference.outputs, reference.outputs)
     inner = _plain(*inner_problem(parameters, database, t), arrays)
-    return _weighted(Mapped(parameters, database, t, inner, database), "base_weights", arrays)
+    return _weighted(Mapped(parameters, database, t, inner), "base_weights", arrays)
 
 
 def _plain(
     parameters: Hyperparameters, database: Database, arrays: Mapping[str, NDArray[Any]]
-) -> Solution:
+) -> BaseSolution:
     """The solution without its outputs' map."""
     if "pivots" not in arrays:
         return dense(parameters, database)
@@ -274,7 +277,7 @@ def _normals(of: str, arrays: Mapping[str, NDArray[Any]]) -> Gaussians:
     return unchecked(mean, covariances(f"{of}_covariance", arrays[f"{of}_covariance"], *mean.shape))
 
 
-def _weighted(solution: Solution, name: str, arrays: Mapping[str, NDArray[Any]]) -> Solution:
+def _weighted(solution: _Some, name: str, arrays: Mapping[str, NDArray[Any]]) -> _Some:
     parameters = solution.hyperparameters
     return solution.with_weights(
         numbers(name, arrays[name], len(solution.centres), parameters.outputs)
@@ -285,14 +288,12 @@ def _kernel(arrays: Mapping[str, NDArray[Any]], kinds: Mapping[str, Any]) -> Ker
     if _KERNEL + KIND in arrays:
         return cast(Kernel, _value(arrays, _KERNEL, kinds))
     if "period" in arrays:
-        return PeriodicKernel(
-            float(numbers("ell", arrays["ell"])), float(numbers("period", arrays["period"]))
-        )
+        return PeriodicKernel(positive("ell", arrays["ell"]), positive("period", arrays["period"]))
     if "channels" not in arrays:
         return GaussianKernel(arrays["ell"])
-    if (channels := float(numbers("channels", arrays["channels"]))) != 2:
+    if (channels := positive("channels", arrays["channels"])) != 2:
         raise ValueError(f"channels: {channels:g} given, 2 needed where it is given.")
-    return VelocityKernel(float(numbers("ell", arrays["ell"])))
+    return VelocityKernel(positive("ell", arrays["ell"]))
 
 
 def _of_value(value: object, prefix: str) -> dict[str, NDArray[Any]]:

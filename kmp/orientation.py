@@ -15,13 +15,14 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kmp.arrays.checks import Array, Seed, check_finite, not_negative, numbers, real
+from kmp.arrays.checks import Array, Seed, check_finite, numbers, real
 from kmp.arrays.immutable import Immutable, frozen
 from kmp.arrays.linear_algebra import symmetric
 from kmp.gaussians import Gaussians, covariances, unchecked
 from kmp.predictor import Uncertainty
 from kmp.primitive import KMP, Saved, checked_primitive
 from kmp.query import MotionPrediction
+from kmp.solution import Solution, least_of_channels
 
 _TINY = 1e-4  # [rad] below it a power series is exact to rounding
 _CONJUGATE = frozen(np.array([-1.0, -1.0, -1.0, 1.0]))
@@ -95,6 +96,21 @@ def exp(zeta: Array, auxiliary: Array) -> Array:
     return multiplied(
         np.concatenate([np.sinc(angle / np.pi) * zeta, np.cos(angle)], axis=1), auxiliary
     )
+
+
+def _nearest_log(quaternions: Array, auxiliary: Array, near: Array) -> Array:
+    """The zeta (V, 3) of the orientations (V, 4) of q or -q that are nearest to `near` (V, 3).
+
+    Those of one orientation are a half turn |zeta| = pi apart, along one axis.
+    """
+    signs = np.where(multiplied(quaternions, auxiliary * _CONJUGATE)[:, 3:] < 0, -1.0, 1.0)
+    zeta = log(signs * quaternions, auxiliary)
+    angle = np.linalg.norm(zeta, axis=1, keepdims=True)
+    along = np.where(angle > _TINY, zeta, near)
+    length = np.linalg.norm(along, axis=1, keepdims=True)
+    axis = along / np.maximum(length, np.finfo(np.float64).tiny)
+    turns = np.round(np.vecdot(axis, near - zeta)[:, None] / np.pi)
+    return np.asarray(zeta + turns * np.pi * axis)
 
 
 def rotation_per_zeta(zeta: ArrayLike) -> Array:
@@ -250,28 +266,25 @@ class _Rotating(Immutable, Saved):
     ) -> Self:
         """A new skill that also goes through desired (V, P + 4) at inputs (V, I), as of `mean`.
 
-        Of q and -q, the one nearer to the skill's present mean is used. `covariance` (n, n) or (V,
-        n, n) [unit^2, rad^2] is that of positions and small rotations; where its rows are 0, of
-        all three of a rotation, they are met as exactly as rounding allows. Skills with rates take
-        velocities too, (V, n) [unit/s, rad/s] with their covariance; None leaves them free.
-        `tolerance` [unit of the inputs] is that of `KMP.adapt`.
+        Of all zeta of an orientation, the one nearest to the skill's present zeta is used.
+        `covariance` (n, n) or (V, n, n) [unit^2, rad^2] is that of positions and small rotations.
+        Where its rows are 0, they are met as exactly as rounding allows; those of a rotation are 0
+        for all three axes, or for none. Skills with rates take velocities too, (V, n) [unit/s,
+        rad/s] with their covariance; None leaves them free. `tolerance` [unit of the inputs] is
+        that of `KMP.adapt`.
 
-        Raises ValueError as `KMP.adapt` does, if a quaternion has another norm than 1, or if rates
-        are given to a skill without.
+        Raises ValueError as `KMP.adapt` does, if a quaternion has another norm than 1, if some axes
+        of a rotation alone are exact, or if rates are given to a skill without.
         """
         where = numbers("inputs", inputs, "V", self.primitive.inputs.shape[1])
-        if tolerance is not None:
-            not_negative("tolerance", tolerance)
         size = self._size
         poses = numbers("desired", desired, len(where), size + 1)
-        present = self.mean(where)[:, self._positions :]
         q = _unit("desired", poses[:, self._positions :])
-        signs = np.where((present * q).sum(axis=1, keepdims=True) < 0, -1.0, 1.0)
-        zeta = log(signs * q, self.auxiliary)
+        present = self.primitive.mean(where)[:, self._positions : size]
+        zeta = _nearest_log(q, self.auxiliary, present)
         values = np.hstack([poses[:, : self._positions], zeta])
         back = np.asarray(np.linalg.inv(self._turn(values)), dtype=np.float64)
-        least = self.primitive.least_variance
-        turned = self._back("covariance", covariance, back, least)
+        turned = self._back("covariance", covariance, back, 0)
         has_rates = self.primitive.kernel.channels > 1
         if (velocities is None) != (velocity_covariance is None):
             raise ValueError("velocities and velocity_covariance: give both, or none.")
@@ -287,8 +300,7 @@ class _Rotating(Immutable, Saved):
         else:
             moving = numbers("velocities", velocities, len(where), size)
             rates = (back @ moving[:, :, None])[:, :, 0]
-            least *= float(self.primitive.kernel.prior_variance[1, 1])
-            rate_covariance = self._back("velocity_covariance", velocity_covariance, back, least)
+            rate_covariance = self._back("velocity_covariance", velocity_covariance, back, 1)
         whole = np.zeros((len(where), 2 * size, 2 * size))
         whole[:, :size, :size] = turned
         whole[:, size:, size:] = rate_covariance
@@ -316,12 +328,11 @@ class _Rotating(Immutable, Saved):
         size = self._size
         return symmetric(turn @ covariance[:, :size, :size] @ turn.mT)
 
-    def _back(self, name: str, covariance: ArrayLike, back: Array, least: float) -> Array:
-        """Covariances J^-1 S J^-T (V, n, n) of outputs or rates, of S of rotations; 0 is exact.
+    def _back(self, name: str, covariance: ArrayLike, back: Array, channel: int) -> Array:
+        """Covariances J^-1 S J^-T (V, n, n) of a channel's outputs, of S of rotations; 0 is exact.
 
-        `back` is J^-1 (V, n, n). `least` is the least variance of an output that rounding does not
-        hide; a rotation's is at most 4 times that. Raises ValueError if a covariance is not
-        positive definite, or too small.
+        `back` is J^-1 (V, n, n). Raises ValueError if a covariance is not positive definite, too
+        small, or exact for some axes of a rotation only.
         """
         count, size, _ = back.shape
         matrices = real(name, covariance)
@@ -329,19 +340,29 @@ class _Rotating(Immutable, Saved):
             np.broadcast_to(matrices, back.shape) if matrices.shape == (size, size) else matrices
         )
         array = numbers(name, matrices, count, size, size)
-        exact = ~array.any(axis=2)
+        exact = np.asarray(~array.any(axis=2))
+        exact_axes = np.count_nonzero(exact[:, self._positions :], axis=1)
+        for n in np.flatnonzero(exact_axes % 3)[:1]:
+            raise ValueError(
+                f"{name}[{n}] is 0 for {exact_axes[n]} of the 3 axes of a rotation: give 0 for all "
+                "three or for none, and a small variance to the axes that matter."
+            )
         rows, outputs = np.nonzero(exact)
         filled = np.array(array)
         filled[rows, outputs, outputs] = 1.0
         checked = covariances(name, filled, count, size)
         turned = symmetric(back @ checked @ back.mT)
         check_finite(name, turned, "too large:")
-        for n in np.flatnonzero(np.linalg.eigvalsh(turned)[:, 0] < least)[:1]:
+        # the least variance of each output; that of a rotation is up to 4 times larger
+        solution: Solution = self.primitive.inner.solution
+        least = least_of_channels(solution)[channel] * solution.hyperparameters.prior_variances
+        over_least = turned / np.sqrt(np.outer(least, least))
+        for n in np.flatnonzero(np.linalg.eigvalsh(over_least)[:, 0] < 1)[:1]:
             smallest = np.linalg.eigvalsh(array[n])[0]
             raise ValueError(
                 f"{name}[{n}] would be lost in rounding: its smallest eigenvalue is "
-                f"{smallest:.3g}, and {4.1 * least:.2g} is enough. Give 0 for the least, or the "
-                "primitive a larger lambda_covariance."
+                f"{smallest:.3g}, and {4.1 * least.max():.2g} is enough. Give 0 for the least, or "
+                "the primitive a larger lambda_covariance."
             )
         turned[rows, outputs, :] = turned[rows, :, outputs] = 0.0
         turned[rows, outputs, outputs] = Gaussians.of([0.0], deviation=0).covariance[0, 0, 0]

@@ -27,12 +27,18 @@ from kmp.constraints import Constrained, LinearConstraints
 from kmp.dense import SINGLE, Dense
 from kmp.functionals import Functionals
 from kmp.gaussians import Gaussians, unchecked
+from kmp.kernel import variances
 from kmp.low_rank import LowRank
 from kmp.problem.database import Changes, Database
 from kmp.problem.hyperparameters import Hyperparameters
-from kmp.solution import Expansion, Solution
+from kmp.solution import BaseSolution, Expansion, Solution
 
 _ONE_SHAPE = 1e-14  # differences between the shapes of covariances that are rounding
+# lambda Sigma / k(s, s) of free outputs, and of free and exact ones that a map mixes: a ratio that
+# leaves two digits of the exact one's
+_FREE_SHARE = 1e8
+_MIXED_FREE = 1e4
+_MIXED_EXACT = 1e-10
 
 
 @contextmanager
@@ -80,21 +86,31 @@ def inner_problem(
 ) -> tuple[Hyperparameters, Database]:
     """The problem in the coordinates x = T^-1 y."""
     inverse = np.linalg.inv(t)
-    matrix = parameters.prior_matrix
-    inside = replace(
+    inner = replace(
         parameters,
         prior_offset=frozen(inverse @ parameters.prior_offset),
-        prior_matrix=None if matrix is None else frozen(inverse @ matrix),
+        prior_matrix=frozen(inverse @ parameters.prior_matrix),
         prior_covariance=None,
     )
-    return inside, Database(database.functionals, _inside(inverse, database.reference))
+    points = database.functionals
+    return inner, Database(points, inside(inner, points, t, database.reference))
 
 
-def _inside(inverse: NDArray[Any], normals: Gaussians) -> Gaussians:
-    """Normals in the coordinates x, without the differences that rounding makes: entries beside the
-    diagonal are 0, and equal variances are equal to the bit, so that one factor serves them.
+def inside(
+    parameters: Hyperparameters, points: Functionals, t: Array, normals: Gaussians
+) -> Gaussians:
+    """Normals of y = T x in the coordinates x, of which the parameters are.
+
+    Without the differences that rounding makes: entries beside the diagonal are 0, and equal
+    variances are equal to the bit, so that one factor serves them.
     """
+    inverse = np.linalg.inv(t)
+    mean = normals.mean @ inverse.T
     covariance = symmetric(inverse @ normals.covariance @ inverse.T)
+    for n in np.flatnonzero(mixes(parameters, points, t, normals)):
+        chosen = slice(n, n + 1)
+        point = points.take(chosen)
+        mean[n], covariance[n] = _of_fixed(parameters, point, t, normals.take(chosen))
     size = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     covariance[np.abs(covariance) < _ONE_SHAPE * size[:, :, None] * size[:, None, :]] = 0.0
     variances = size**2
@@ -104,7 +120,52 @@ def _inside(inverse: NDArray[Any], normals: Gaussians) -> Gaussians:
             if (differences <= _ONE_SHAPE * variances[:, other]).all():
                 covariance[:, output, output] = covariance[:, other, other]
                 break
-    return unchecked(normals.mean @ inverse.T, covariance)
+    return unchecked(mean, covariance)
+
+
+def mixes(
+    parameters: Hyperparameters, points: Functionals, t: Array, normals: Gaussians
+) -> NDArray[np.bool_]:
+    """(N,) true where T mixes free outputs with others, or exact ones: variances so far apart
+    that rounding hides the small ones in the coordinates x.
+    """
+    variances = np.diagonal(normals.covariance, axis1=1, axis2=2)
+    is_free = variances > _FREE_SHARE * _prior_variances(parameters, points, t)
+    kinds = np.stack([is_free, normals.exact, ~(is_free | normals.exact)])  # (3, N, O)
+    enters = kinds @ (np.linalg.inv(t) != 0).T  # each kind in each x
+    return np.asarray((enters.sum(axis=0) > 1).any(axis=1))
+
+
+def _prior_variances(parameters: Hyperparameters, points: Functionals, t: Array) -> Array:
+    """(N, O) the prior variances of y = T x over lambda, for x of these parameters."""
+    penalty = min(parameters.lambda_mean, parameters.lambda_covariance)
+    kernel = variances(parameters.kernel, points).repeat(parameters.channel_outputs, axis=1)
+    prior = t @ parameters.over_outputs(np.eye(parameters.kernel.channels)) @ t.T
+    return np.asarray(kernel * np.diagonal(prior) / penalty)
+
+
+def _of_fixed(
+    parameters: Hyperparameters, point: Functionals, t: Array, normal: Gaussians
+) -> tuple[Array, Array]:
+    """Mean (O,) and covariance (O, O) of x for one normal of y = T x with free or exact outputs.
+
+    With the rows H of T of the outputs that are not free: x = H^+ y and H^+ Sigma H^+T, plus a
+    variance in the null space of H by which rounding does not hide the least one.
+    """
+    prior = _prior_variances(parameters, point, t)[0]
+    variance = np.diagonal(normal.covariance[0])
+    fixed = np.flatnonzero(variance <= _FREE_SHARE * prior)
+    rows = t[fixed]
+    sizes = np.linalg.norm(rows, axis=1)
+    back = np.linalg.pinv(rows / sizes[:, None]) / sizes
+    noise = normal.covariance[0][np.ix_(fixed, fixed)]
+    least = _MIXED_EXACT * len(fixed) * prior[fixed]
+    noise = noise + np.diag(np.maximum(least - variance[fixed], 0.0))
+    free = np.sqrt(_MIXED_FREE * _prior_variances(parameters, point, np.eye(len(t)))[0])
+    null = free[:, None] * (np.eye(len(t)) - back @ rows) * free
+    before = parameters.prior_at(point)[0]
+    mean = before + back @ (normal.mean[0, fixed] - rows @ before)
+    return mean, symmetric(back @ noise @ back.T + null)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -114,18 +175,18 @@ class Mapped(Expansion):
     hyperparameters: Hyperparameters
     database: Database
     t: Array
-    inner: Solution
-    base: Database
-    """The database before any adaptation."""
+    inner: Any  # a solution
     constraints: LinearConstraints | None = None
 
     @property
     def representation(self) -> Literal["dense", "low_rank"]:
-        return self.inner.representation
+        kind: Literal["dense", "low_rank"] = self.inner.representation
+        return kind
 
     @property
     def functionals(self) -> Functionals:
-        return self.inner.functionals
+        functionals: Functionals = self.inner.functionals
+        return functionals
 
     @cached_property
     def weights(self) -> Array:
@@ -148,17 +209,19 @@ class Mapped(Expansion):
         return np.asarray(self.t @ self.inner.posterior_covariance(rows) @ self.t.T)
 
     def adapted(self, changes: Changes) -> Mapped:
-        inside = changes._replace(points=_inside(np.linalg.inv(self.t), changes.points))
-        return replace(self, database=self.base.changed(changes), inner=self.inner.adapted(inside))
+        points = inside(self.inner.hyperparameters, changes.functionals, self.t, changes.points)
+        inner = self.inner.adapted(changes._replace(points=points))
+        return replace(self, database=self.database.changed(changes), inner=inner)
 
     def with_hyperparameters(self, hyperparameters: Hyperparameters) -> Mapped:
-        inside, _ = inner_problem(hyperparameters, self.database, self.t)
+        inner, _ = inner_problem(hyperparameters, self.database, self.t)
         return replace(
-            self, hyperparameters=hyperparameters, inner=self.inner.with_hyperparameters(inside)
+            self, hyperparameters=hyperparameters, inner=self.inner.with_hyperparameters(inner)
         )
 
     def to_arrays(self) -> dict[str, NDArray[np.float64]]:
-        return self.inner.to_arrays() | {"output_map": self.t}
+        arrays: dict[str, NDArray[np.float64]] = self.inner.to_arrays()
+        return arrays | {"output_map": self.t}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -171,8 +234,6 @@ class Decoupled(Expansion):
     database: Database
     parts: tuple[Any, ...]  # a solution of each group
     groups: tuple[NDArray[np.intp], ...]  # the outputs of each group
-    base: Database
-    """The database before any adaptation."""
 
     @property
     def representation(self) -> Literal["dense", "low_rank"]:
@@ -215,21 +276,28 @@ class Decoupled(Expansion):
         return out
 
     def adapted(self, changes: Changes) -> Solution:
-        if not _is_decoupled(changes.points, self.groups):
+        if not self._is_decoupled(changes.points):
             return self._together.adapted(changes)
         parts = tuple(
             part.adapted(changes._replace(points=_of_group(changes.points, group)))
             for part, group in zip(self.parts, self.groups, strict=True)
         )
-        return replace(self, database=self.base.changed(changes), parts=parts)
+        return replace(self, database=self.database.changed(changes), parts=parts)
 
-    @property
-    def _together(self) -> Solution:
-        """The base's solution as one system."""
-        first = self.parts[0].base or self.parts[0]
+    @cached_property
+    def _together(self) -> Dense | LowRank:
+        """The solution as one system."""
+        first = self.parts[0]
         if isinstance(first, LowRank):
-            return LowRank.fit(self.hyperparameters, self.base, first.features)
-        return Dense(self.hyperparameters, self.base)
+            return LowRank.fit(self.hyperparameters, self.database, first.features)
+        return Dense(self.hyperparameters, self.database)
+
+    def _is_decoupled(self, normals: Gaussians) -> bool:
+        """True if no covariance couples two groups."""
+        number = np.empty(normals.outputs, dtype=np.intp)
+        for n, group in enumerate(self.groups):
+            number[group] = n
+        return not normals.covariance[:, number[:, None] != number].any()
 
     def with_hyperparameters(self, hyperparameters: Hyperparameters) -> Decoupled:
         parts = tuple(
@@ -263,7 +331,7 @@ class Decoupled(Expansion):
             )
             for group in groups
         )
-        return cls(parameters, database, parts, groups, database)
+        return cls(parameters, database, parts, groups)
 
 
 def decoupled_groups(
@@ -298,24 +366,15 @@ def decoupled_groups(
     return tuple((every + np.array(group)).ravel() for group in groups)
 
 
-def _is_decoupled(normals: Gaussians, groups: tuple[NDArray[np.intp], ...]) -> bool:
-    """True if no covariance couples two groups."""
-    number = np.empty(normals.outputs, dtype=np.intp)
-    for n, group in enumerate(groups):
-        number[group] = n
-    return not normals.covariance[:, number[:, None] != number].any()
-
-
 def _of_group(normals: Gaussians, group: NDArray[np.intp]) -> Gaussians:
     return unchecked(normals.mean[:, group], normals.covariance[:, group[:, None], group])
 
 
 def _parameters_of(parameters: Hyperparameters, group: NDArray[np.intp]) -> Hyperparameters:
-    matrix = parameters.prior_matrix
     return replace(
         parameters,
-        prior_offset=parameters.prior_offset[group],
-        prior_matrix=None if matrix is None else matrix[group],
+        prior_offset=frozen(parameters.prior_offset[group]),
+        prior_matrix=frozen(parameters.prior_matrix[group]),
     )
 
 
@@ -324,7 +383,7 @@ def constraints_of(solution: Solution) -> LinearConstraints | None:
     return solution.constraints if isinstance(solution, (Constrained, Mapped)) else None
 
 
-def as_one(base: Solution) -> Solution:
+def as_one(base: Solution) -> BaseSolution:
     """The dense solution of a base as one system, to which constraints can be added."""
     if isinstance(base, Mapped):
         return replace(base, inner=as_one(base.inner))

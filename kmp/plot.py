@@ -118,9 +118,7 @@ class Plotted:
             axes = plt.subplots(
                 axes_count, 1, sharex=True, squeeze=False, figsize=size, layout="constrained"
             )[1]
-        into: list[Any] = [axes]
-        if isinstance(axes, (list, tuple, np.ndarray)):
-            into = list(np.ravel(np.asarray(axes, dtype=object)))
+        into: list[Any] = list(np.ravel(np.asarray(axes, dtype=object)))
         if len(into) != axes_count:
             raise ValueError(f"axes: {len(into)} given, {axes_count} needed.")
         for i, ax in enumerate(into):
@@ -240,19 +238,15 @@ def _ellipses(normals: Gaussians, plane: list[int], times: int) -> Path:
 def _add_legend(axes: Axes) -> None:
     """Add the legend above the axes; a label that occurs twice is shown once."""
     handles, labels = axes.get_legend_handles_labels()
-    named = dict(zip(reversed(labels), reversed(handles), strict=True))
-    look: dict[str, Any] = {
-        "frameon": False,
-        "fontsize": "small",
-        "columnspacing": 1.2,
-        "handlelength": 1.4,
-    }
-    order = sorted(named, key=labels.index)
+    named = dict(zip(labels, handles, strict=True))
     axes.legend(
-        [named[label] for label in order],
-        order,
+        list(named.values()),
+        list(named),
         loc="lower left",
         bbox_to_anchor=(0, 1),
         ncols=4,
-        **look,
+        frameon=False,
+        fontsize="small",
+        columnspacing=1.2,
+        handlelength=1.4,
     )

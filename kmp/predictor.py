@@ -24,7 +24,7 @@ from kmp.low_rank import Features
 from kmp.problem.database import Changes, Database
 from kmp.problem.hyperparameters import AffineMean
 from kmp.query import MotionPrediction, Query
-from kmp.solution import BLOCK, Solution, least_variances, mean_at
+from kmp.solution import BLOCK, Solution, least_of_channels, mean_at
 
 _RESIDUAL = 1e-10  # residual of the features, as a share of k(s, s), in the uncertainty by distance
 
@@ -90,11 +90,10 @@ class Predictor(Immutable):
         if (mean_and_row := self._compiled_mean(s)) is not None:
             return mean_and_row[0]
         s = self._checked_many(s)
-        return (
-            self.inner.query.mean(self.inner.query.row(s[0]))[None]
-            if len(s) == 1
-            else mean_at(self.inner.solution, s)
-        )
+        if len(s) == 1:
+            query = self.inner.query
+            return query.mean(s[0], query.row(s[0]))[None]
+        return mean_at(self.inner.solution, s)
 
     def predict(self, queries: ArrayLike) -> Gaussians:
         """xi(s) with its covariance at queries (M, I): M normals.
@@ -110,10 +109,9 @@ class Predictor(Immutable):
             return unchecked(mean_and_row[0], compiled.covariance(mean_and_row[1])[None])
         s = self._checked_many(s)
         if len(s) == 1:
-            row = self.inner.query.row(s[0])
-            return unchecked(
-                self.inner.query.mean(row)[None], self.inner.query.covariance(row.kernel)[None]
-            )
+            query = self.inner.query
+            row = query.row(s[0])
+            return unchecked(query.mean(s[0], row)[None], query.covariance(row)[None])
         batches = [s[i : i + BLOCK] for i in range(0, len(s), BLOCK)]
         posterior = [
             self.inner.solution.posterior_covariance(self._rows(batch)) for batch in batches
@@ -121,9 +119,7 @@ class Predictor(Immutable):
         stacked = (
             np.concatenate(posterior) if posterior else np.empty((0, self.outputs, self.outputs))
         )
-        return unchecked(
-            self.mean(s), nearest_positive_semidefinite(stacked) * self.inner.query.covariance_scale
-        )
+        return unchecked(self.mean(s), self._scaled(stacked))
 
     def predict_joint(self, queries: ArrayLike) -> Gaussians:
         """xi(s) at queries (M, I) as one normal over all M O outputs, query after query.
@@ -135,10 +131,7 @@ class Predictor(Immutable):
         if len(s) == 0:
             raise ValueError("queries: none given, at least 1 needed.")
         posterior = self.inner.solution.posterior_covariance_one(self._rows(s), self.kernel(s, s))
-        covariance = (
-            nearest_positive_semidefinite(posterior[None]) * self.inner.query.covariance_scale
-        )
-        return unchecked(self.mean(s).reshape(1, -1), covariance)
+        return unchecked(self.mean(s).reshape(1, -1), self._scaled(posterior[None]))
 
     def sample(self, queries: ArrayLike, count: int, *, seed: Seed = 0) -> Array:
         """Trajectories through queries (M, I), drawn from `predict_joint`: (count, M, O).
@@ -148,7 +141,7 @@ class Predictor(Immutable):
         Raises ValueError as `predict` does, or if the count is below 1.
         """
         joint = self.predict_joint(queries)
-        drawn = drawn_paths(joint.mean[0], joint.covariance[0], count, seed)
+        drawn = drawn_paths(joint, self._units(joint.outputs), count, seed)
         return drawn.reshape(count, -1, self.outputs)
 
     def predict_motion(
@@ -163,8 +156,8 @@ class Predictor(Immutable):
 
         The input's velocity v (I,) [unit of the inputs / s] and acceleration a (I,) [unit of the
         inputs / s^2] give those of the output: J v, and J a + d^2 xi(s + t v)/dt^2. The numbers are
-        those of `predict`, `jacobian` and `curvature`: bit for bit without Numba, to rounding with
-        it. The covariance takes longer than all else, and can be left out.
+        those of `jacobian` and `curvature`, and to rounding those of `predict`. The covariance
+        takes longer than all else, and can be left out.
 
         Raises ValueError if a shape differs or a number is not finite.
         """
@@ -185,15 +178,8 @@ class Predictor(Immutable):
         The derivative of equation (8). Raises ValueError if the shape differs or a number is not
         finite.
         """
-        s = real("query", query)
-        compiled = self.inner.compiled_query
-        if (
-            compiled is not None
-            and s.shape == (self._dimensions,)
-            and (jacobian := compiled.jacobian(s)) is not None
-        ):
-            return jacobian
-        return self.inner.query.jacobian(self.inner.query.row(self._one_query(s)))
+        still = np.zeros(self._dimensions)
+        return self.predict_motion(query, still, still, covariance=False).jacobian
 
     def jacobians(self, queries: ArrayLike) -> Array:
         """dxi/ds at queries (M, I): (M, O, I), equal to `jacobian` but for rounding.
@@ -211,9 +197,8 @@ class Predictor(Immutable):
         inputs / s], this is the output's acceleration [unit of the outputs / s^2] at constant v.
         Raises ValueError if a shape differs or a number is not finite.
         """
-        s = self._one_query(query)
         v = self._checked("direction", direction)
-        return self.inner.query.curvature(self.inner.query.row(s), v)
+        return self.predict_motion(query, v, 0 * v, covariance=False).curvature
 
     def uncertainty(self, queries: ArrayLike) -> Uncertainty:
         """The covariance at queries (M, I), by its causes: differing demonstrations, distance.
@@ -228,10 +213,9 @@ class Predictor(Immutable):
         residual = self.inner.solution.hyperparameters.over_outputs(
             self.kernel.prior_variance - z @ z.transpose(0, 2, 1)
         )
-        distance = nearest_positive_semidefinite(residual) * self.inner.query.covariance_scale
-        return Uncertainty(
-            frozen(nearest_positive_semidefinite(total - distance)), frozen(distance)
-        )
+        distance = self._scaled(residual)
+        variability = nearest_positive_semidefinite(total - distance, self._units(self.outputs))
+        return Uncertainty(frozen(variability), frozen(distance))
 
     @property
     def kernel(self) -> Kernel:
@@ -255,13 +239,9 @@ class Predictor(Immutable):
         With a `VelocityKernel`, that of a rate is 2 ell times larger. `adapt` raises ValueError for
         smaller variances.
         """
-        parameters = self.inner.solution.hyperparameters
-        anywhere = Functionals(np.zeros((1, self._dimensions)))
-        penalty = parameters.lambda_covariance
-        if self.representation == "low_rank":
-            penalty = min(penalty, parameters.lambda_mean)
-        least = least_variances(parameters, anywhere, penalty)[0, 0]
-        return float(least * parameters.prior_variances.max())
+        solution: Solution = self.inner.solution
+        variances = solution.hyperparameters.prior_variances
+        return float(least_of_channels(solution)[0] * variances.max())
 
     @property
     def prior_mean(self) -> Array | AffineMean:
@@ -288,7 +268,8 @@ class Predictor(Immutable):
 
     @cached_property
     def _spanned(self) -> Features:
-        return Features.spanning(self.kernel, self.inner.solution.functionals, tolerance=_RESIDUAL)
+        points = self.inner.solution.database.functionals
+        return Features.spanning(self.kernel, points, tolerance=_RESIDUAL)
 
     @cached_property
     def _dimensions(self) -> int:
@@ -299,6 +280,16 @@ class Predictor(Immutable):
         return between(
             self.kernel, Functionals(queries, directions), self.inner.solution.functionals
         )
+
+    def _scaled(self, posterior: Array) -> Array:
+        """N / lambda_c times posterior covariances (M, n, n), made positive semi-definite."""
+        nearest = nearest_positive_semidefinite(posterior, self._units(posterior.shape[1]))
+        return nearest * self.inner.query.covariance_scale
+
+    def _units(self, count: int) -> Array:
+        """The prior deviations of `count` outputs, query after query."""
+        deviations = self.inner.solution.hyperparameters.prior_deviations
+        return np.tile(deviations, count // self.outputs)
 
     def _compiled_mean(self, queries: Array) -> tuple[Array, Array] | None:
         """The mean (M, O) by compiled loops, and the last kernel row; None if these cannot."""
@@ -339,10 +330,13 @@ class Predictor(Immutable):
         return self._wrapped(s)
 
 
-def drawn_paths(mean: Array, covariance: Array, count: int, seed: Seed) -> Array:
-    """Draws (count, n) of a normal, whose covariance may be singular."""
+def drawn_paths(normal: Gaussians, units: Array, count: int, seed: Seed) -> Array:
+    """Draws (count, n) of one normal, whose covariance may be singular.
+
+    `units` (n,) are the outputs' sizes, so that a small output's variance is not lost in rounding.
+    """
     whole("count", count)
-    values, vectors = np.linalg.eigh(covariance)
-    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    values, vectors = np.linalg.eigh(normal.covariance[0] / np.outer(units, units))
+    root = units[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
     random = np.random.default_rng(seeded(seed))
-    return np.asarray(mean + random.standard_normal((count, len(values))) @ root.T)
+    return np.asarray(normal.mean[0] + random.standard_normal((count, len(values))) @ root.T)

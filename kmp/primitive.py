@@ -35,7 +35,7 @@ from kmp.dense import Dense
 from kmp.functionals import Functionals
 from kmp.gaussians import Gaussians, check_gaussians, check_pairs, unchecked
 from kmp.kernel import Kernel
-from kmp.low_rank import RANK, TOLERANCE, LowRank
+from kmp.low_rank import RANK, TOLERANCE
 from kmp.outputs import as_one, constrained, constraints_of, is_one
 from kmp.plot import Plotted, Points, Shown
 from kmp.predictor import Inner, Predictor
@@ -43,9 +43,10 @@ from kmp.problem.database import Changes, Database, warn_of_missed
 from kmp.problem.hyperparameters import AffineMean, Hyperparameters
 from kmp.radial import GaussianKernel
 from kmp.representation import LARGE, solved
-from kmp.solution import Solution, mean_of, resolved
+from kmp.solution import BaseSolution, Solution, mean_of, resolved
 from kmp.time_kernels import VelocityKernel
 
+_SAME_GOAL = 1e-12  # differences of goals below this share of the largest are rounding
 _REACH_STEPS = 300  # number of distances at which a via-point's effect is computed
 
 
@@ -167,7 +168,8 @@ class KMP(Predictor, Plotted, Saved):
         be moved again and again; others remain, see `without_via_points`. N of the covariance
         remains that of the base, so that the covariance far away does not change.
 
-        Points of a deviation of 0 (`Gaussians.of`) are met as exactly as rounding allows.
+        Points of a deviation of 0 (`Gaussians.of`) are met as exactly as rounding allows, beside
+        free outputs that a covariance couples to them to about 1e-7.
 
         If a row of `directions` (V, I) [unit of the inputs] is not zero, the normal is that of the
         output's derivative along it [unit of the outputs], dxi/ds times the direction: a velocity
@@ -175,21 +177,16 @@ class KMP(Predictor, Plotted, Saved):
         nothing.
 
         A `ViaPointMissed` warning names the desired points that the mean misses by more than 3 of
-        their deviations and by more than 0.001 (1 mm, if the unit is the metre).
+        their deviations and by more than 0.001 of the outputs' deviations far from the inputs, the
+        roots of k(s, s) (x) B (1 mm without B, if the unit is the metre).
 
         Raises ValueError if shapes do not agree, a number is not finite, the tolerance is below 0,
         or the equations cannot be solved to working precision.
         """
         via = numbers("inputs", inputs, "V", self._dimensions)
         check_pairs("desired", via, desired, self.outputs)
-        if tolerance is None:
-            tolerance = self.base.spacing / 2
-        not_negative("tolerance", tolerance)
         points = Functionals.checked(via, directions)
-        desired = resolved(self.inner.solution.hyperparameters, points, desired)
-        adapted = self._through(points, desired, tolerance)
-        warn_of_missed(desired, mean_of(adapted.inner.solution, points), self.kernel.channels)
-        return adapted
+        return self._through(points, desired, self._tolerance(tolerance))
 
     def without_via_points(self, inputs: ArrayLike, *, tolerance: float | None = None) -> KMP:
         """A new primitive without the via-points at these inputs (V, I), all of them there.
@@ -207,16 +204,11 @@ class KMP(Predictor, Plotted, Saved):
                 f"they are at {brief(changes.inputs) if len(changes.inputs) else 'no input'}."
             )
         remaining = ~same.any(axis=1)
-        if tolerance is None:
-            tolerance = self.base.spacing / 2
-        before: Solution = self.inner.solution
-        base = self.base
-        if (known := constraints_of(before)) is not None:
-            base = base.constrained(known)
         points = changes.functionals.take(remaining)
-        return base._through(  # noqa: SLF001 (of its own kind)
-            points, changes.points.take(remaining), not_negative("tolerance", tolerance)
-        )
+        normals = changes.points.take(remaining)
+        before = self.base.inner.changes
+        changes = self._changes(before, points, normals, self._tolerance(tolerance))
+        return _combined(self.base, changes, self._constraints)
 
     def adapt_jacobian(self, inputs: ArrayLike, jacobians: ArrayLike, *, deviation: float) -> KMP:
         """A new primitive with these Jacobians dxi/ds at inputs (V, I): jacobians (V, O, I).
@@ -234,9 +226,7 @@ class KMP(Predictor, Plotted, Saved):
         variance = squared("deviation", deviation)
         desired = Gaussians(means, np.tile(variance * np.eye(self.outputs), (len(axes), 1, 1)))
         points = Functionals.checked(frozen(np.repeat(via, self._dimensions, axis=0)), axes)
-        adapted = self._through(points, desired, 0.0)
-        warn_of_missed(desired, mean_of(adapted.inner.solution, points), self.kernel.channels)
-        return adapted
+        return self._through(points, desired, 0.0)
 
     def constrained(self, constraints: LinearConstraints) -> KMP:
         """A new primitive whose mean satisfies these constraints too, to 1e-9. LC-KMP.
@@ -260,20 +250,16 @@ class KMP(Predictor, Plotted, Saved):
         ):
             if count != needed:
                 raise ValueError(f"constraints: {count} {name} given, {needed} needed.")
-        solution: Solution = self.inner.solution
-        if (known := constraints_of(solution)) is not None:
-            constraints = known.joined(constraints)
-        if not is_one(solution):
-            base = self.base.inner.solution
-            size = base.database.reference.mean.size
-            if solution.representation == "low_rank" and size > LARGE:
-                raise ValueError(
-                    f"constraints: a low rank primitive of {size} numbers given, at most {LARGE} "
-                    "or the dense "
-                    'representation needed. Fit fewer points, or with representation="dense".'
-                )
-            return self._on(KMP(Inner.of_base(as_one(base).solved()))).constrained(constraints)
-        return self._changed(constrained(solution, constraints), self.inner.changes, self.base)
+        size = self.base.reference.mean.size
+        if self.representation == "low_rank" and size > LARGE:
+            raise ValueError(
+                f"constraints: a low rank primitive of {size} numbers given, at most {LARGE} "
+                "or the dense representation needed. Fit fewer points, or with "
+                'representation="dense".'
+            )
+        if self._constraints is not None:
+            constraints = self._constraints.joined(constraints)
+        return _combined(self.base, self.inner.changes, constraints)
 
     def refitted(self, reference: Gaussians) -> KMP:
         """The primitive of another reference at the base's points, and of the same via-points.
@@ -281,13 +267,9 @@ class KMP(Predictor, Plotted, Saved):
         Raises ValueError as `fit` and `adapt` do.
         """
         points = self.base.inner.solution.database.functionals
-        parameters = self.inner.solution.hyperparameters
         check_pairs("reference", points.inputs, reference, self.outputs)
-        database = Database(points, resolved(parameters, points, reference))
-        fitted = KMP(
-            Inner.of_base(solved(parameters, database, self.representation, RANK, TOLERANCE))
-        )
-        return self._on(fitted)
+        fitted = self._solved_anew(self._database(points, reference))
+        return _combined(fitted, self.inner.changes, self._constraints)
 
     def extended(
         self, inputs: ArrayLike, reference: Gaussians, *, directions: ArrayLike | None = None
@@ -304,44 +286,65 @@ class KMP(Predictor, Plotted, Saved):
         added = numbers("inputs", inputs, "M", self._dimensions)
         check_some("inputs", added)
         check_pairs("reference", added, reference, self.outputs)
-        before: Solution = self.base.inner.solution
+        before = self._base_solution
         points = Functionals.checked(added, directions)
-        more = Database(points, resolved(before.hyperparameters, points, reference))
-        database = before.database.joined(more)
-        grown = (
-            before.extended(database)
-            if isinstance(before, Dense)
-            else solved(before.hyperparameters, database, self.representation, RANK, TOLERANCE)
+        database = before.database.joined(self._database(points, reference))
+        if isinstance(before, Dense):
+            grown = KMP(Inner.of_base(before.extended(database)))
+        else:
+            grown = self._solved_anew(database)
+        return _combined(grown, self.inner.changes, self._constraints)
+
+    def _database(self, points: Functionals, normals: Gaussians) -> Database:
+        return Database(points, resolved(self.inner.solution.hyperparameters, points, normals))
+
+    def _solved_anew(self, database: Database) -> KMP:
+        """The primitive of another database, with the same parameters."""
+        parameters = self.inner.solution.hyperparameters
+        return KMP(
+            Inner.of_base(solved(parameters, database, self.representation, RANK, TOLERANCE))
         )
-        return self._on(KMP(Inner.of_base(grown)))
 
     def _through(self, points: Functionals, desired: Gaussians, tolerance: float) -> KMP:
+        """The primitive through these points. Warns if it misses one."""
         if len(points) == 0:
             return self
-        before = self.inner.changes
+        parameters = self.inner.solution.hyperparameters
+        adapted = self._toward(points, desired, tolerance)
+        desired = resolved(parameters, points, desired)
+        warn_of_missed(desired, mean_of(adapted.inner.solution, points), parameters)
+        return adapted
+
+    def _toward(self, points: Functionals, desired: Gaussians, tolerance: float) -> KMP:
+        """The primitive through these points, whether it misses one or not."""
+        desired = resolved(self.inner.solution.hyperparameters, points, desired)
+        changes = self._changes(self.inner.changes, points, desired, tolerance)
+        return _combined(self.base, changes, self._constraints)
+
+    def _changes(
+        self, before: Changes, points: Functionals, desired: Gaussians, tolerance: float
+    ) -> Changes:
+        """The changes of the base by earlier ones and then by these points."""
         nearest = self.base.inner.solution.database.nearest(points, tolerance, self.kernel.period)
         remaining = ~before.near(points, tolerance, self.kernel.period)
-        changes = Changes(
+        return Changes(
             frozen(np.union1d(before.replaced, nearest)) if len(nearest) else before.replaced,
             Functionals.concatenated([before.functionals.take(remaining), points]),
             Gaussians.concatenated([before.points.take(remaining), desired]),
         )
-        return self._changed(self.inner.solution.adapted(changes), changes, self.base)
 
-    def _on(self, fitted: KMP) -> KMP:
-        """This primitive's via-points and constraints on another base."""
-        if self is self.base:
-            return fitted
-        return self._changed(self._solution_on(fitted), self.inner.changes, fitted)
+    def _tolerance(self, tolerance: float | None) -> float:
+        if tolerance is None:
+            return self.base.spacing / 2
+        return not_negative("tolerance", tolerance)
 
-    def _solution_on(self, base: KMP) -> Solution:
-        """The solution of another base with this primitive's via-points and constraints."""
-        before: Solution = self.inner.solution
-        changed: Solution = base.inner.solution
-        if len(self.via_inputs):
-            changed = changed.adapted(self.inner.changes)
-        known = constraints_of(before)
-        return changed if known is None else constrained(changed, known)
+    @property
+    def _constraints(self) -> LinearConstraints | None:
+        return constraints_of(self.inner.solution)
+
+    @property
+    def _base_solution(self) -> BaseSolution:
+        return cast(BaseSolution, self.base.inner.solution)
 
     def _to_plot(self) -> Shown:
         """The reference points and via-points that are values, not derivatives."""
@@ -365,11 +368,6 @@ class KMP(Predictor, Plotted, Saved):
 
         return load(path, kernels=kernels).primitive
 
-    @staticmethod
-    def _changed(solution: Solution, changes: Changes, base: KMP) -> KMP:
-        """The primitive of a base with these changes, solved."""
-        return KMP(Inner(solution.solved(), changes, base.inner.count), base)
-
     def with_lambda_covariance(self, lambda_covariance: float) -> KMP:
         """This primitive with another lambda of the covariance; the mean keeps its bits.
 
@@ -378,16 +376,15 @@ class KMP(Predictor, Plotted, Saved):
         """
         other = positive("lambda_covariance", lambda_covariance)
         parameters = replace(self.inner.solution.hyperparameters, lambda_covariance=other)
-        before = self.base.inner.solution
-        base = KMP(
-            Inner.of_base(
-                before.with_hyperparameters(parameters).with_weights(before.weights).solved()
-            )
-        )
+        before = self._base_solution
+        other_base = before.with_hyperparameters(parameters).with_weights(before.weights)
+        base = KMP(Inner.of_base(other_base.solved()))
         if self is self.base:
             return base
-        weighted = self._solution_on(base).with_weights(self.inner.solution.weights)
-        return self._changed(weighted, self.inner.changes, base)
+        changes = self.inner.changes
+        solution = _solution(base, changes, self._constraints)
+        weighted = solution.with_weights(self.inner.solution.weights)
+        return KMP(Inner(weighted.solved(), changes, base.inner.count), base)
 
     def adapt_many(
         self, points: Sequence[tuple[ArrayLike, Gaussians]], *, tolerance: float | None = None
@@ -405,9 +402,7 @@ class KMP(Predictor, Plotted, Saved):
                     f"points[{i}]: {brief(pair)} given, a pair of inputs (V, I) and V normals "
                     "needed."
                 )
-        if tolerance is None:
-            tolerance = self.base.spacing / 2
-        not_negative("tolerance", tolerance)
+        tolerance = self._tolerance(tolerance)
         inputs = [numbers("inputs", via, "V", self._dimensions) for via, _ in pairs]
         for via, (_, desired) in zip(inputs, pairs, strict=True):
             check_pairs("desired", via, desired, self.outputs)
@@ -419,23 +414,23 @@ class KMP(Predictor, Plotted, Saved):
 
         Raises ValueError as `mean` does, or if there are constraints.
         """
-        before: Solution = self.inner.solution
-        if constraints_of(before) is not None:
+        if self._constraints is not None:
             raise ValueError(
                 "goal_jacobian: a primitive with constraints given, whose mean is not affine in "
                 "its goals; one without needed."
             )
         functionals = Functionals(self._checked_many(queries))
         changes = self.inner.changes
-        at_rest = mean_of(before, functionals)
+        at_rest = mean_of(self.inner.solution, functionals)
         goals = changes.points.mean
+        steps = self.inner.solution.hyperparameters.prior_deviations
         jacobian = np.empty((*at_rest.shape, *goals.shape))
-        for index in np.ndindex(goals.shape):
+        for n, o in np.ndindex(goals.shape):
             moved = np.array(goals)
-            moved[index] += 1.0
+            moved[n, o] += steps[o]
             points = unchecked(moved, changes.points.covariance)
-            other = before.adapted(changes._replace(points=points))
-            jacobian[:, :, *index] = mean_of(other, functionals) - at_rest
+            other = self._base_solution.adapted(changes._replace(points=points))
+            jacobian[:, :, n, o] = (mean_of(other, functionals) - at_rest) / steps[o]
         return jacobian
 
     def via_point_reach(self, query: ArrayLike, *, share: float = 0.1) -> Array:
@@ -456,10 +451,7 @@ class KMP(Predictor, Plotted, Saved):
         desired = Gaussians.of(
             self.mean(s[None]) + 1.0, deviation=np.repeat([0.0, np.inf], values)[: self.outputs]
         )
-        point = Functionals(s[None])
-        adapted = self._through(
-            point, resolved(self.inner.solution.hyperparameters, point, desired), 0.0
-        )
+        adapted = self._toward(Functionals(s[None]), desired, 0.0)
         reach = np.empty(len(s))
         for i, farthest in enumerate(self._farthest(s)):
             r = np.linspace(0.0, farthest, _REACH_STEPS)
@@ -525,6 +517,24 @@ class KMP(Predictor, Plotted, Saved):
         return self.inner.changes.points
 
 
+def _solution(base: KMP, changes: Changes, constraints: LinearConstraints | None) -> Solution:
+    """The solution of a base with these changes and constraints."""
+    changed: Solution = base.inner.solution
+    if len(changes.inputs):
+        changed = base._base_solution.adapted(changes)  # noqa: SLF001 (of its own kind)
+    return changed if constraints is None else constrained(changed, constraints)
+
+
+def _combined(base: KMP, changes: Changes, constraints: LinearConstraints | None) -> KMP:
+    """The primitive of a base with these changes and constraints, solved."""
+    if constraints is None and not len(changes.inputs):
+        return base
+    if constraints is not None and not is_one(base.inner.solution):
+        base = KMP(Inner.of_base(as_one(base.inner.solution).solved()))
+    solution = _solution(base, changes, constraints)
+    return KMP(Inner(solution.solved(), changes, base.inner.count), base)
+
+
 def checked_primitive(value: object, name: str = "primitive") -> KMP:
     """The value as a `KMP`. Raises ValueError if it is none."""
     check_kind(name, value, KMP, "KMP.fit(inputs, reference, kernel=..., lambda_mean=...)")
@@ -565,41 +575,37 @@ class Alternatives(Sequence[KMP]):
     def mean(self, queries: ArrayLike) -> Array:
         """The means (G, M, O) of all G primitives at queries (M, I), equal to theirs to rounding.
 
-        Of goals with the same number of via-points it takes hardly more time than of one. Raises
-        ValueError as `KMP.mean` does.
+        Of goals that differ in their means only, at the same inputs, it takes hardly more time than
+        of one. Raises ValueError as `KMP.mean` does.
         """
-        primitive = self._primitive
-        solution: Solution = primitive.inner.solution
-        functionals = Functionals(primitive._checked_many(queries))  # noqa: SLF001 (of its own kind)
-        if len({len(via) for via in self._inputs}) > 1 or constraints_of(solution) is not None:
-            return np.stack([adapted.mean(queries) for adapted in self])
-        inputs = np.stack(self._inputs)
-        covariance = np.stack([desired.covariance for desired in self._desired])
-        if (inputs == inputs[0]).all() and (covariance == covariance[0]).all():
-            return self._at_one_input(functionals)
-        if isinstance(solution, (Dense, LowRank)) and not len(primitive.via_inputs):
-            return mean_of(solution, functionals) + self._moved(solution, functionals)
+        first = self._desired[0]
+        differ_in_means = all(
+            np.array_equal(inputs, self._inputs[0])
+            and np.array_equal(desired.covariance, first.covariance)
+            for inputs, desired in zip(self._inputs, self._desired, strict=True)
+        )
+        if differ_in_means and self._primitive._constraints is None:  # noqa: SLF001 (of its own kind)
+            return self._by_directions(queries)
         return np.stack([adapted.mean(queries) for adapted in self])
 
-    def _at_one_input(self, queries: Functionals) -> Array:
-        """The means (G, M, O), by one adaptation: they are affine in the goals."""
-        first = self[0]
-        goals = np.stack([desired.mean for desired in self._desired])
-        jacobian = first.goal_jacobian(queries.inputs)[:, :, -goals.shape[1] :]
-        by_goal = jacobian.reshape(len(queries), goals.shape[2], -1)
-        away = (goals - goals[0]).reshape(len(self), -1)
-        return np.asarray(first.mean(queries.inputs) + np.moveaxis(by_goal @ away.T, 2, 0))
-
-    def _moved(self, solution: Dense | LowRank, queries: Functionals) -> Array:
-        """The moves (G, M, O) of the mean, by one triangular solve."""
-        from kmp.goals import moved_means  # rarely used
-
-        points = Functionals(np.concatenate(self._inputs))
-        normals = Gaussians.concatenated(self._desired)
-        added = Database(points, resolved(solution.hyperparameters, points, normals))
-        period = self._primitive.kernel.period
-        replaced = [
-            solution.database.nearest(Functionals(via), self._tolerance, period)
-            for via in self._inputs
-        ]
-        return moved_means(solution, added, replaced, queries)
+    def _by_directions(self, queries: ArrayLike) -> Array:
+        """The means (G, M, O), which are affine in the goals: by one adaptation for each of the
+        directions in which these differ.
+        """
+        primitive = self._primitive
+        points = Functionals(self._inputs[0])
+        first = self._desired[0]
+        away = np.stack([desired.mean - first.mean for desired in self._desired])
+        units = primitive.inner.solution.hyperparameters.prior_deviations
+        shares, sizes, directions = np.linalg.svd(
+            (away / units).reshape(len(self), -1), full_matrices=False
+        )
+        mean = self[0].mean(queries)
+        means = np.tile(mean, (len(self), 1, 1))
+        for share, size, direction in zip(shares.T, sizes, directions, strict=True):
+            if size > _SAME_GOAL * sizes[0]:
+                step = size * direction.reshape(first.mean.shape) * units
+                goal = unchecked(first.mean + step, first.covariance)
+                moved = primitive._toward(points, goal, self._tolerance)  # noqa: SLF001
+                means += share[:, None, None] * (moved.mean(queries) - mean)
+        return means

@@ -10,19 +10,16 @@ The arrays that a query reads are prepared once. `kmp.loops.query` computes the 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 import numpy as np
 
 from kmp.arrays.checks import Array
-from kmp.arrays.immutable import Immutable, frozen
+from kmp.arrays.immutable import Immutable
 from kmp.arrays.linear_algebra import nearest_positive_semidefinite
-from kmp.functionals import Derivatives, Functionals
-from kmp.kernel import between, third_derivative, unstretched
-from kmp.radial import GaussianKernel
+from kmp.functionals import Functionals
+from kmp.kernel import Kernel, between, third_derivative
 from kmp.solution import Solution
-from kmp.time_kernels import PeriodicKernel, VelocityKernel
 
 
 class MotionPrediction(NamedTuple):
@@ -42,28 +39,13 @@ class MotionPrediction(NamedTuple):
     """(O,) [unit of the outputs / s^2] the acceleration that the input's velocity makes alone."""
 
 
-class KernelRow(NamedTuple):
-    """The kernel between one query and R centres."""
-
-    query: Array  # (I,)
-    offsets: Array  # (R, I) x - x_r, in the kernel's coordinates
-    values: Array  # (R,) exp(-scale |x - x_r|^2)
-    kernel: Array  # (R,) or (C, R C) k(s, s_r), derived where s_r stands for a derivative
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class Query(Immutable):
     """The arrays of a solution for one query: R centres, C channels, D outputs a channel."""
 
     solution: Solution
-    kernel: GaussianKernel | VelocityKernel | PeriodicKernel
-    scale: float
-    stretch: Array  # (I,): x = stretch * s are the kernel's coordinates
-    centres: Array  # (R, I), there
-    derivatives: Derivatives | None  # the derivatives among the R centres
     weights: Array  # (R C, D)
-    weight_rows: Array  # (D, R C), the same
-    prior_mean: Array  # (O, 1) its offset, or (O, 1 + I) and its matrix
+    prior_mean: Array  # (O, 1 + I) its offset and its matrix
     covariance_scale: float  # N / lambda_c
 
     @classmethod
@@ -73,105 +55,58 @@ class Query(Immutable):
         Raises ValueError if the solution cannot be computed.
         """
         parameters = solution.hyperparameters
-        centres = solution.centres
-        kernel = cast(GaussianKernel, parameters.kernel)
-        inputs = centres.shape[1]
-        # a subclass may have other formulas than those for one query
-        is_general = type(kernel) not in (GaussianKernel, VelocityKernel, PeriodicKernel)
-        scale, stretch = (1.0, unstretched(inputs)) if is_general else kernel.coordinates(inputs)
         weights = solution.weights.reshape(-1, parameters.channel_outputs)
-        return (_GeneralQuery if is_general else cls)(
-            solution,
-            kernel,
-            scale,
-            stretch,
-            frozen(centres * stretch),
-            solution.functionals.derivatives(stretch),
-            weights,
-            frozen(np.ascontiguousarray(weights.T)),
-            parameters.prior_columns,
-            count / parameters.lambda_covariance,
-        )
+        scale = count / parameters.lambda_covariance
+        return cls(solution, weights, parameters.prior_columns, scale)
 
-    @cached_property
-    def unstretched(self) -> bool:
-        """True if the kernel's coordinates are the inputs themselves."""
-        return bool((self.stretch == 1.0).all())
+    @property
+    def kernel(self) -> Kernel:
+        """The kernel k."""
+        return self.solution.hyperparameters.kernel
 
-    @cached_property
-    def prior_offset(self) -> Array:
-        """(O,) the prior mean's offset."""
-        return frozen(np.ascontiguousarray(self.prior_mean[:, 0]))
+    def row(self, query: Array) -> Array:
+        """The kernel row of a query (I,): k(s, s_r) (R,) or (C, R C)."""
+        k = between(self.kernel, Functionals(query[None]), self.solution.functionals)
+        return k[0] if len(k) == 1 else k
 
-    def row(self, query: Array) -> KernelRow:
-        """The kernel row of a query (I,)."""
-        offsets = (query if self.unstretched else query * self.stretch) - self.centres
-        values = self.kernel.values(offsets, self.scale)
-        return KernelRow(
-            query, offsets, values, self.kernel.row(offsets, values, self.scale, self.derivatives)
-        )
-
-    def mean(self, row: KernelRow) -> Array:
+    def mean(self, query: Array, row: Array) -> Array:
         """xi(s) (O,). Equation (8)."""
-        mean = row.kernel @ self.weights
-        mean = (mean if mean.ndim == 1 else mean.ravel()) + self.prior_offset
-        return np.asarray(
-            mean if self.prior_mean.shape[1] == 1 else mean + self.prior_mean[:, 1:] @ row.query
-        )
+        prior = self.prior_mean
+        return np.asarray((row @ self.weights).ravel() + prior[:, 0] + prior[:, 1:] @ query)
 
-    def covariance(self, kernel: Array) -> Array:
-        """N / lambda_c (k(s, s) I - k (K + lambda_c Sigma)^-1 k^T) (O, O), for a row's k. IJRR."""
-        posterior = self.solution.posterior_covariance_one(kernel)
-        return np.asarray(nearest_positive_semidefinite(posterior[None])[0] * self.covariance_scale)
-
-    def jacobian(self, row: KernelRow) -> Array:
-        """dxi/ds (O, I). Equation (8), derived."""
-        jacobian = self.kernel.jacobian(
-            row.offsets, row.values, self.scale, self.weight_rows, self.derivatives
-        )
-        jacobian = jacobian if self.unstretched else jacobian * self.stretch
-        return jacobian if self.prior_mean.shape[1] == 1 else jacobian + self.prior_mean[:, 1:]
+    def covariance(self, row: Array) -> Array:
+        """N / lambda_c (k(s, s) I - k (K + lambda_c Sigma)^-1 k^T) (O, O), for a row. IJRR."""
+        posterior = self.solution.posterior_covariance_one(row)
+        deviations = self.solution.hyperparameters.prior_deviations
+        nearest = nearest_positive_semidefinite(posterior[None], deviations)[0]
+        return np.asarray(nearest * self.covariance_scale)
 
     def jacobians(self, queries: Array) -> Array:
         """dxi/ds at queries (M, I): (M, O, I). Equation (8), derived."""
-        functionals = self.solution.functionals
-        kernel = self.kernel
-        i = len(self.stretch)
-        if type(kernel) is GaussianKernel and self.derivatives is None:
-            # -2 scale sum_r k_r w_r (x - x_r) is one product with w_r and w_r x_r. With the origin
-            # at the mean of the centres, the differences lose few digits.
-            products = between(kernel, Functionals(queries), functionals) @ self._moments
-            x = queries * self.stretch - self._origin
-            pulls = products[:, : self.weights.shape[1], None]
-            moments = products[:, self.weights.shape[1] :]
-            slopes = (pulls * x[:, None, :] - moments.reshape(len(x), -1, i)) * (
-                -2 * self.scale * self.stretch
-            )
-        else:
-            along = Functionals(
-                np.repeat(queries, i, axis=0), np.tile(np.eye(i), (len(queries), 1))
-            )
-            products = between(kernel, along, functionals) @ self.weights
-            slopes = products.reshape(len(queries), i, -1).transpose(0, 2, 1)
-        return slopes if self.prior_mean.shape[1] == 1 else slopes + self.prior_mean[:, 1:]
+        count, inputs = queries.shape
+        axes = np.tile(np.eye(inputs), (count, 1))
+        along = Functionals(np.repeat(queries, inputs, axis=0), axes)
+        products = between(self.kernel, along, self.solution.functionals) @ self.weights
+        slopes = products.reshape(count, inputs, -1).transpose(0, 2, 1)
+        return np.asarray(slopes + self.prior_mean[:, 1:])
 
-    @cached_property
-    def _origin(self) -> Array:
-        """(I,) the mean of the centres, in the kernel's coordinates."""
-        return frozen(np.asarray(self.centres.mean(axis=0)))
-
-    @cached_property
-    def _moments(self) -> Array:
-        """(R, O + O I) the weights w_r, and w_r (x_r - origin)."""
-        products = self.weights[:, :, None] * (self.centres - self._origin)[:, None, :]
-        return frozen(np.hstack([self.weights, products.reshape(len(products), -1)]))
-
-    def curvature(self, row: KernelRow, velocity: Array) -> Array:
+    def curvature(self, query: Array, velocity: Array) -> Array:
         """d^2 xi(s + t v)/dt^2 (O,) at t = 0, for v (I,). Equation (8), derived twice."""
-        direction = velocity * self.stretch
-        return self.kernel.curvature(
-            row.offsets, row.values, self.scale, self.weights, direction, self.derivatives
-        )
+        if not velocity.any():
+            return np.zeros(len(self.prior_mean))
+        # k is a function of s - s': minus its derivative by both along v is that by s, twice
+        functionals = self.solution.functionals
+        centres = functionals.inputs
+        along = np.broadcast_to(velocity, centres.shape)
+        bend = -self.kernel(query[None], centres, velocity[None], along)
+        observed = np.flatnonzero(~functionals.values)
+        if len(observed):
+            offsets = query - centres[observed]
+            directions = functionals.along[observed]
+            third = third_derivative(self.kernel, offsets, directions, velocity)
+            blocks = bend.reshape(len(bend), len(centres), -1)
+            blocks[:, observed] = -third.transpose(1, 0, 2)
+        return np.asarray(bend @ self.weights).ravel()
 
     def motion(
         self, query: Array, velocity: Array, acceleration: Array, *, covariance: bool
@@ -180,37 +115,13 @@ class Query(Immutable):
         (I,).
         """
         row = self.row(query)
-        jacobian = self.jacobian(row)
-        curvature = self.curvature(row, velocity)
+        jacobian = self.jacobians(query[None])[0]
+        curvature = self.curvature(query, velocity)
         return MotionPrediction(
-            self.mean(row),
+            self.mean(query, row),
             jacobian @ velocity,
             jacobian @ acceleration + curvature,
-            self.covariance(row.kernel) if covariance else None,
+            self.covariance(row) if covariance else None,
             jacobian,
             curvature,
         )
-
-
-class _GeneralQuery(Query):
-    """The same for any `Kernel`, by calls of it. Its coordinates are the inputs themselves."""
-
-    def row(self, query: Array) -> KernelRow:
-        k = between(self.kernel, Functionals(query[None]), self.solution.functionals)
-        k = k[0] if len(k) == 1 else k
-        return KernelRow(query, query - self.centres, k, k)
-
-    def jacobian(self, row: KernelRow) -> Array:
-        return np.asarray(self.jacobians(row.query[None])[0])
-
-    def curvature(self, row: KernelRow, velocity: Array) -> Array:
-        if not velocity.any():
-            return np.zeros(len(self.prior_mean))
-        # k is a function of s - s': minus its derivative by both along v is that by s, twice
-        along = np.broadcast_to(velocity, self.centres.shape)
-        bend = -self.kernel(row.query[None], self.centres, velocity[None], along)
-        if self.derivatives is not None:
-            rows, observed = self.derivatives
-            offsets = row.offsets[rows]
-            bend[0, rows] = -third_derivative(self.kernel, offsets, observed, velocity)
-        return np.asarray(bend @ self.weights).ravel()

@@ -16,7 +16,6 @@ from scipy.spatial.distance import cdist
 from kmp.arrays.checks import Array, check_some, numbers, positive, real
 from kmp.arrays.immutable import frozen
 from kmp.composition import Composable
-from kmp.functionals import Derivatives
 from kmp.kernel import directed, unstretched
 
 # Derivatives of f may have a pole at u = 0, where u_a is 0: they are evaluated at larger u only.
@@ -136,14 +135,14 @@ class RadialKernel(Composable):
         mixed = k[both]
         if mixed.size:
             across = 2 * scale * (v @ w.T)
-            mixed = self._derived(u[both], mixed, left[:, j] * right[i], across)
-        k[i] = self._derived(u[i], k[i], left)
-        k[:, j] = self._derived(u[:, j], k[:, j], right)
+            mixed = self._derived(u[both], left[:, j] * right[i], across)
+        k[i] = self._derived(u[i], left)
+        k[:, j] = self._derived(u[:, j], right)
         k[both] = mixed
         return k
 
-    def _derived(self, u: Array, k: Array, slope: Array, across: Array | None = None) -> Array:
-        """D_a k, by the slope -u_a; with -u_ab given, D_ab k by the slope u_a u_b. k is f(u)."""
+    def _derived(self, u: Array, slope: Array, across: Array | None = None) -> Array:
+        """D_a k, by the slope -u_a; with -u_ab given, D_ab k by the slope u_a u_b."""
         above_0 = np.maximum(u, _LEAST_U)
         if across is None:
             return -self.first_derivative(above_0) * slope
@@ -184,68 +183,6 @@ class GaussianKernel(RadialKernel):
         return self.profile(u)
 
     third_derivative = first_derivative
-
-    def _derived(self, u: Array, k: Array, slope: Array, across: Array | None = None) -> Array:
-        if type(self) is not GaussianKernel:
-            return super()._derived(u, k, slope, across)
-        return k * (slope if across is None else slope + across)
-
-    def variances(self, along: Array) -> Array:
-        if type(self) is not GaussianKernel:
-            return super().variances(along)
-        scale, stretch = self.coordinates(along.shape[1])
-        squares = 2 * scale * ((along * stretch) ** 2).sum(axis=1, keepdims=True)
-        return np.where(squares > 0, squares, 1.0)
-
-    @staticmethod
-    def values(offsets: Array, scale: float) -> Array:
-        value = np.vecdot(offsets, offsets)
-        value *= -scale
-        return np.asarray(np.exp(value, value))
-
-    @staticmethod
-    def row(
-        offsets: Array, values: Array, scale: float, derivatives: Derivatives | None = None
-    ) -> Array:
-        if derivatives is None:
-            return values
-        row = values.copy()
-        rows, along = derivatives
-        row[rows] *= 2 * scale * np.vecdot(offsets[rows], along)
-        return row
-
-    @staticmethod
-    def jacobian(
-        offsets: Array,
-        values: Array,
-        scale: float,
-        weight_rows: Array,
-        derivatives: Derivatives | None = None,
-    ) -> Array:
-        if derivatives is None:
-            return np.asarray((weight_rows * (values * (-2 * scale))) @ offsets)
-        row = GaussianKernel.row(offsets, values, scale, derivatives)
-        rows, along = derivatives
-        through = (weight_rows[:, rows] * (values[rows] * (2 * scale))) @ along
-        return np.asarray((weight_rows * (row * (-2 * scale))) @ offsets + through)
-
-    @staticmethod
-    def curvature(
-        offsets: Array,
-        values: Array,
-        scale: float,
-        weights: Array,
-        direction: Array,
-        derivatives: Derivatives | None = None,
-    ) -> Array:
-        slope = (2 * scale) * (offsets @ direction)
-        bend = slope * slope - 2 * scale * float(direction @ direction)
-        if derivatives is None:
-            return np.asarray((values * bend) @ weights)
-        bend *= GaussianKernel.row(offsets, values, scale, derivatives)
-        rows, along = derivatives
-        bend[rows] -= values[rows] * (4 * scale) * (along @ direction) * slope[rows]
-        return np.asarray(bend @ weights)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

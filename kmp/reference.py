@@ -25,7 +25,7 @@ from kmp.arrays.checks import (
 )
 from kmp.arrays.linear_algebra import symmetric
 from kmp.gaussians import Gaussians, covariances
-from kmp.mixture import one_thread
+from kmp.mixture import deviations, one_thread
 
 _SIGNAL = 1e-3, 1e3  # bounds of the function's variance over the variance of the output
 _LENGTH = 1e-2, 1e3  # bounds of a length over the deviation of the input
@@ -69,8 +69,10 @@ def gaussian_process_reference(
         np.concatenate([part[i][rows] for part, rows in zip(data, chosen, strict=True)])
         for i in (0, 1)
     )
-    scale = _deviations(s)
-    size = _deviations(y)
+    check_finite("demonstrations", s.std(axis=0), "too large for their deviation:")
+    check_finite("demonstrations", y.std(axis=0), "too large for their deviation:")
+    scale = deviations(s)
+    size = deviations(y)
     centre = y.mean(axis=0)
     s = s / scale
     queries = where / scale
@@ -84,13 +86,6 @@ def gaussian_process_reference(
         mean * size + centre,
         covariances("regularization: covariance", symmetric(covariance), *mean.shape),
     )
-
-
-def _deviations(values: Array) -> Array:
-    """The deviation of each column; 1 for a constant one."""
-    deviations = values.std(axis=0)
-    check_finite("demonstrations", deviations, "too large for their deviation:")
-    return np.where(deviations > 0, deviations, 1.0)
 
 
 def _process(

@@ -7,12 +7,15 @@ below a share of N.
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
+from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from kmp.arrays.checks import RankReached
 from kmp.dense import SINGLE, Dense
-from kmp.low_rank import Features, LowRank
+from kmp.low_rank import FLOOR, Features, LowRank
 from kmp.outputs import (
     Decoupled,
     Mapped,
@@ -25,6 +28,8 @@ from kmp.problem.database import Database
 from kmp.problem.hyperparameters import Hyperparameters
 from kmp.solution import Solution, is_resolved
 
+_Some = TypeVar("_Some", Dense, LowRank)
+
 _SMALL = 1500  # N O up to which finding the rank of several inputs costs more than it can save
 LARGE = 6000  # N O above which the dense solution takes seconds and 300 MB
 # the low rank is faster below these r / (N C), estimated and found
@@ -33,6 +38,7 @@ _LOW = 0.45
 # measured: r = 8 + 3.5 range sqrt(ell) over one input
 _RANK_AT_0 = 8.0
 _RANK_PER_LENGTH = 3.5
+_FEW = 64  # N C up to which all features that rounding allows cost nothing
 _ROUNDING = 1e-12  # a residual of this share of k(s, s) is rounding, and always allowed
 
 
@@ -48,17 +54,26 @@ def solved(
     if t is None:
         return _solved(parameters, database, representation, rank, tolerance)
     with variances_over_prior(parameters):
-        inside = inner_problem(parameters, database, t)
-        inner = _solved(*inside, representation, rank, tolerance)
-    return Mapped(parameters, database, t, inner, database).solved()
+        problem = inner_problem(parameters, database, t)
+        inner = _solved(*problem, representation, rank, tolerance)
+    return Mapped(parameters, database, t, inner).solved()
 
 
 def dense(parameters: Hyperparameters, database: Database) -> Dense | Decoupled:
     """The dense solution, of each group of outputs by itself where these decouple."""
     groups = decoupled_groups(parameters, database.reference, alike=True)
+    return _of_groups(parameters, database, groups, Dense)
+
+
+def _of_groups(
+    parameters: Hyperparameters,
+    database: Database,
+    groups: tuple[NDArray[np.intp], ...],
+    solution: Callable[[Hyperparameters, Database], _Some],
+) -> _Some | Decoupled:
     if len(groups) == 1:
-        return Dense(parameters, database)
-    return Decoupled.of_parts(parameters, database, groups, lambda p, d, _: Dense(p, d))
+        return solution(parameters, database)
+    return Decoupled.of_parts(parameters, database, groups, lambda p, d, _: solution(p, d))
 
 
 def _solved(
@@ -77,6 +92,8 @@ def _solved(
     most = min(rank, int(_LOW * len(database) * parameters.kernel.channels)) if optional else rank
     points = database.functionals
     kernel = parameters.kernel
+    if len(points) * kernel.channels <= _FEW:
+        tolerance = min(tolerance, 2 * FLOOR)
     features, residual, values = Features.with_values(
         kernel, points, rank=most, tolerance=tolerance
     )
@@ -85,15 +102,8 @@ def _solved(
     if optional and not (enough and is_resolved(parameters, database)):
         return dense(parameters, database).solved()
     groups = decoupled_groups(parameters, database.reference, alike=False)
-    solution: LowRank | Decoupled = (
-        LowRank.fit(parameters, database, features, values=values)
-        if len(groups) == 1
-        else Decoupled.of_parts(
-            parameters,
-            database,
-            groups,
-            lambda p, d, _: LowRank.fit(p, d, features, values=values),
-        )
+    solution = _of_groups(
+        parameters, database, groups, lambda p, d: LowRank.fit(p, d, features, values=values)
     ).solved()
     if not enough:
         warnings.warn(

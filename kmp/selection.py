@@ -12,7 +12,7 @@ from functools import cached_property
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from kmp.arrays.checks import (
     Array,
@@ -30,7 +30,7 @@ from kmp.criteria.folds import Fold
 from kmp.criteria.likelihood import most_likely
 from kmp.gaussians import Gaussians
 from kmp.kernel import Kernel, checked_kernel
-from kmp.mixture import GaussianMixture, deviations, mixture_of, one_thread
+from kmp.mixture import GaussianMixture, deviations, mixture_of, one_thread, varies
 from kmp.primitive import KMP
 from kmp.radial import GaussianKernel
 from kmp.time_kernels import VelocityKernel
@@ -95,22 +95,20 @@ class Learned(Immutable):
 
     def report(self, count: int = 10) -> str:
         """The best `count` of the scores as a table, then what was chosen and its reach."""
-        lines = [f"{'ell':>40} {'lambda':>10} {'lambda_c':>10} {'RMSE':>10} {'-log lik.':>10}"]
+        lines = [_row("ell", "lambda", "lambda_c", "RMSE", "-log lik.")]
         for score in self.scores[: whole("count", count)]:
-            ell = " ".join(f"{value:.3g}" for value in np.atleast_1d(score.ell))
-            other = "" if score.lambda_covariance is None else f"{score.lambda_covariance:.3g}"
-            likelihood = (
-                ""
-                if score.negative_log_likelihood is None
-                else f"{score.negative_log_likelihood:.3f}"
-            )
             lines.append(
-                f"{ell:>40} {score.lambda_mean:>10.3g} {other:>10} {score.rmse:>10.4g} "
-                f"{likelihood:>10}"
+                _row(
+                    " ".join(f"{value:.3g}" for value in np.atleast_1d(score.ell)),
+                    f"{score.lambda_mean:.3g}",
+                    "" if score.lambda_covariance is None else f"{score.lambda_covariance:.3g}",
+                    f"{score.rmse:.4g}",
+                    ""
+                    if score.negative_log_likelihood is None
+                    else f"{score.negative_log_likelihood:.3f}",
+                )
             )
-        lines.append(
-            f"{'mixture regression alone':>40} {'':>10} {'':>10} {self.regression_rmse:>10.4g}"
-        )
+        lines.append(_row("mixture regression alone", "", "", f"{self.regression_rmse:.4g}"))
         kernel = self.primitive.kernel
         penalty = self.primitive.lambda_mean
         reach = " ".join(f"{distance:.3g}" for distance in self.reach)
@@ -118,6 +116,10 @@ class Learned(Immutable):
             f"chosen: {kernel!r}, lambda {penalty:.3g}; a via-point matters up to {reach} from it"
         )
         return "\n".join(lines)
+
+
+def _row(name: str, *cells: str) -> str:
+    return f"{name:>40}" + "".join(f" {cell:>10}" for cell in cells)
 
 
 @dataclass(frozen=True)
@@ -152,10 +154,10 @@ class _Recipe:
         """The regression of a mixture at inputs (N, I), in the units of the outputs."""
         dimensions = inputs.shape[1]
         output_unit = self.unit[dimensions:]
-        found = mixture.regress(inputs / self.unit[:dimensions])
+        regression = mixture.regress(inputs / self.unit[:dimensions])
         return Gaussians(
-            found.mean * output_unit,
-            found.covariance * np.multiply.outer(output_unit, output_unit),
+            regression.mean * output_unit,
+            regression.covariance * np.multiply.outer(output_unit, output_unit),
         )
 
     def reference(
@@ -179,26 +181,64 @@ class _Recipe:
         nothing = np.empty((0, 0))
         return Fold(frozen(inputs), reference, frozen(prior), nothing, nothing, np.nan)
 
-    def folds(
-        self, data: Sequence[tuple[Array, Array]], mixtures: Sequence[GaussianMixture], shown: bool
-    ) -> _Folds:
-        """The folds, each without one demonstration, from the mixtures of the others."""
-        return _Folds(
-            tuple(self._fold(data, h, mixture, shown) for h, mixture in enumerate(mixtures)),
-            shown,
-            self.channels,
-        )
 
-    def _fold(
-        self, data: Sequence[tuple[Array, Array]], h: int, mixture: GaussianMixture, shown: bool
-    ) -> Fold:
-        training = self.reference([*data[:h], *data[h + 1 :]], mixture, shown)
-        indices = np.linspace(0, len(data[h][0]) - 1, min(len(data[h][0]), _HELD_OUT)).astype(int)
-        inputs = data[h][0][indices]
-        outputs = data[h][1][indices]
-        miss = (self.regressed(mixture, inputs).mean - outputs)[
-            :, : outputs.shape[1] // self.channels
+class _Taught(NamedTuple):
+    """Demonstrations, each inputs (T, I) and outputs (T, O), and their mixture."""
+
+    recipe: _Recipe
+    data: list[tuple[Array, Array]]
+    mixture: GaussianMixture
+
+    def of_outputs(self, chosen: NDArray[np.bool_]) -> _Taught:
+        """The same with the chosen outputs (O,) only; with all, if none is chosen."""
+        if chosen.all() or not chosen.any():
+            return self
+        data = [(s, xi[:, chosen]) for s, xi in self.data]
+        unit = self.recipe.unit
+        inputs = len(unit) - len(chosen)
+        recipe = replace(self.recipe, unit=np.append(unit[:inputs], unit[inputs:][chosen]))
+        return _Taught(recipe, data, recipe.mixture(data))
+
+    def reference(self, shown: bool) -> Fold:
+        """The reference of all demonstrations."""
+        return self.recipe.reference(self.data, self.mixture, shown)
+
+    def folds(self, options: Sequence[bool]) -> list[_Folds]:
+        """The folds, each without one demonstration, for each option of `shown`.
+
+        Raises ValueError if there is only one demonstration.
+        """
+        if len(self.data) < 2:
+            raise ValueError(
+                f"{len(self.data)} demonstration given: at least 2 needed to choose parameters by "
+                "leaving one out. Give kernel, lambda_mean and lambda_covariance, or criterion "
+                '"likelihood", or another demonstration.'
+            )
+        recipe = self.recipe
+        others = [[*self.data[:h], *self.data[h + 1 :]] for h in range(len(self.data))]
+        mixtures = [recipe.mixture(training, self.mixture) for training in others]
+        return [
+            _Folds(
+                tuple(
+                    self._held_out(recipe.reference(training, mixture, option), mixture, held_out)
+                    for training, mixture, held_out in zip(others, mixtures, self.data, strict=True)
+                ),
+                option,
+                recipe.channels,
+            )
+            for option in options
         ]
+
+    def _held_out(
+        self, training: Fold, mixture: GaussianMixture, held_out: tuple[Array, Array]
+    ) -> Fold:
+        """The fold of a reference, with the errors of its mixture on what is held out."""
+        samples = len(held_out[0])
+        indices = np.linspace(0, samples - 1, min(samples, _HELD_OUT)).astype(int)
+        inputs = held_out[0][indices]
+        outputs = held_out[1][indices]
+        values = outputs.shape[1] // self.recipe.channels
+        miss = (self.recipe.regressed(mixture, inputs).mean - outputs)[:, :values]
         return replace(
             training, held_inputs=inputs, held_outputs=outputs, regression_rmse=rms(miss)
         )
@@ -276,6 +316,8 @@ def learn(
     outputs are values and then their rates over time, the kernel a VelocityKernel. What is tried
     follows the data's units.
 
+    An output that never changes has no part in the choice.
+
     Raises ValueError if shapes do not agree, a number is not finite, a parameter is out of its
     range, the inputs are too far from 0 for their deviation, or there are too few samples for the
     components, or demonstrations for a choice.
@@ -301,23 +343,18 @@ def learn(
     unit = deviations(np.concatenate([np.hstack(pair) for pair in data]))
     recipe = _Recipe(components, seeded(seed), count, regularization, channels, unit)
     _check_precision(data)
-    mixture = recipe.mixture(data)
+    taught = _Taught(recipe, data, recipe.mixture(data))
+    # an output that never changes has no part in the choice
+    is_varying = varies(np.concatenate([xi[:, :values] for _, xi in data]))
+    decisive = taught.of_outputs(np.tile(is_varying, channels))
     is_shown = points == "shown" or (points == "auto" and data[0][0].shape[1] > 1)
     scores: list[Score] = []
     plain = np.nan
     is_incomplete = kernel is None or lambda_mean is None or lambda_covariance is None
     if is_incomplete and criterion == "left-out":
-        if len(data) < 2:
-            raise ValueError(
-                f"{len(data)} demonstration given: at least 2 needed to choose parameters by "
-                "leaving one out. "
-                'Give kernel, lambda_mean and lambda_covariance, or criterion "likelihood", or '
-                "another demonstration."
-            )
-        mixtures = [recipe.mixture([*data[:h], *data[h + 1 :]], mixture) for h in range(len(data))]
-        asked = [is_shown, False] if points == "auto" and is_shown else [is_shown]
         search = _Search(kernel, lambda_mean, scales == "one")
-        choices = [recipe.folds(data, mixtures, option) for option in asked]
+        options = [is_shown, False] if points == "auto" and is_shown else [is_shown]
+        choices = decisive.folds(options)
         # over one input the matrices are those of few features
         with one_thread() if data[0][0].shape[1] == 1 else nullcontext():
             folds, kernel, lambda_mean, scores = search.best(choices)
@@ -325,21 +362,22 @@ def learn(
                 lambda_covariance = _likeliest(folds, kernel, lambda_mean, scores)
         is_shown = folds.shown
         plain = float(np.sqrt(np.mean([fold.regression_rmse**2 for fold in folds.each])))
-    full = recipe.reference(data, mixture, is_shown)
     if is_incomplete and criterion == "likelihood":
-        start = 0.5 / _variances(full.inputs)
+        informative = decisive.reference(is_shown)
+        start = 0.5 / _variances(informative.inputs)
         likeliest = most_likely(
-            full.database,
-            full.prior_mean,
+            informative.database,
+            informative.prior_mean,
             kernel or (VelocityKernel(float(start[0])) if velocity else GaussianKernel(start)),
             lambda_mean,
             free="none" if kernel else scales,
         )
         kernel = likeliest.kernel
         lambda_mean = likeliest.lambda_mean
-        lambda_covariance = lambda_covariance or len(full.inputs) / likeliest.signal_variance
+        lambda_covariance = lambda_covariance or len(informative.inputs) / likeliest.signal_variance
     assert kernel is not None, "given or chosen"
     assert lambda_mean is not None, "given or chosen"
+    full = taught.reference(is_shown)
     order = sorted(scores, key=_best_first)
     primitive = KMP.fit(
         full.inputs,
@@ -350,7 +388,7 @@ def learn(
         prior_mean=full.prior_mean * output_unit,
         prior_covariance=size**2,
     )
-    return Learned(primitive, mixture, tuple(order), plain)
+    return Learned(primitive, taught.mixture, tuple(order), plain)
 
 
 def _check_precision(data: Sequence[tuple[Array, Array]]) -> None:
@@ -372,7 +410,8 @@ def _variances(inputs: Array) -> Array:
     """The variances (I,) of inputs (N, I), above 0."""
     variances = np.var(inputs, axis=0)
     # one that never changed has no length
-    return np.where(variances > 0, variances, variances.max() or 1.0)
+    largest = variances.max() if varies(inputs).any() else 1.0
+    return np.where(varies(inputs), variances, largest)
 
 
 def _best_first(score: Score) -> tuple[float, float]:

@@ -9,9 +9,9 @@ from numpy.typing import ArrayLike
 from sklearn.base import BaseEstimator, RegressorMixin
 from sklearn.utils.validation import check_is_fitted, validate_data
 
-from kmp.arrays.checks import Array, brief, positive, squared, whole
+from kmp.arrays.checks import Array, brief, squared, whole
 from kmp.gaussians import Gaussians
-from kmp.mixture import GaussianMixture, deviations
+from kmp.mixture import GaussianMixture, deviations, varies
 from kmp.primitive import KMP
 from kmp.radial import GaussianKernel
 
@@ -76,10 +76,8 @@ class KMPRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
             inputs,
             reference,
             kernel=GaussianKernel(self._ell(inputs)),
-            lambda_mean=positive("lambda_mean", self.lambda_mean),
-            lambda_covariance=None
-            if self.lambda_covariance is None
-            else positive("lambda_covariance", self.lambda_covariance),
+            lambda_mean=self.lambda_mean,
+            lambda_covariance=self.lambda_covariance,
             prior_mean=mean,
             prior_covariance=deviation**2,
         )
@@ -108,4 +106,6 @@ class KMPRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
             raise ValueError(
                 f'ell: {brief(self.ell)} given, a number, one for each input, or "scale" needed.'
             )
-        return 1.0 / (inputs.shape[1] * (float(inputs.var()) or 1.0))
+        columns = inputs.reshape(-1, 1)
+        variance = float(inputs.var()) if varies(columns)[0] else 1.0
+        return 1.0 / (inputs.shape[1] * variance)

@@ -86,17 +86,21 @@ class Solution(Protocol):
     def posterior_covariance(self, rows: Array) -> Array:
         """The covariances (M, O, O) for the kernel rows (M C, R C) of M queries, each by itself."""
 
-    def adapted(self, changes: Changes) -> Solution:
-        """The solution of the base database, before any adaptation, with these changes."""
-
-    def with_hyperparameters(self, hyperparameters: Hyperparameters) -> Solution:
-        """The solution of a base's database with other parameters, not solved yet."""
-
     def with_weights(self, weights: Array) -> Self:
         """This solution with stored weights (R, O), which are then not computed."""
 
+
+class BaseSolution(Solution, Protocol):
+    """The solution of a database before any adaptation."""
+
+    def adapted(self, changes: Changes) -> Solution:
+        """The solution of the database with these changes."""
+
+    def with_hyperparameters(self, hyperparameters: Hyperparameters) -> Self:
+        """The solution of the database with other parameters, not solved yet."""
+
     def to_arrays(self) -> dict[str, NDArray[np.float64]]:
-        """Arrays of the base's solution that a file holds besides database and weights."""
+        """Arrays that a file holds besides database and weights."""
 
 
 def mean_at(solution: Solution, queries: Array) -> Array:
@@ -133,6 +137,8 @@ def check_resolved(
     names is sufficient for this lambda, or for `both`.
     """
     penalty = parameters.lambda_mean if name == "lambda_mean" else parameters.lambda_covariance
+    if points.exceeds(parameters.kernel, _RESOLVED / penalty):
+        return
     least = penalty * points.least_shares(parameters.kernel)
     for n in np.flatnonzero(least < _RESOLVED)[:1]:
         enough = penalty * _RESOLVED / max(least[n], 1e-300)
@@ -153,7 +159,7 @@ def check_resolved(
 def is_resolved(parameters: Hyperparameters, points: Database) -> bool:
     """True if rounding of k(s, s) hides lambda Sigma with neither lambda."""
     penalty = min(parameters.lambda_mean, parameters.lambda_covariance)
-    return bool((penalty * points.least_shares(parameters.kernel) >= _RESOLVED).all())
+    return points.exceeds(parameters.kernel, _RESOLVED / penalty)
 
 
 def least_variances(parameters: Hyperparameters, points: Functionals, penalty: float) -> Array:
@@ -161,14 +167,25 @@ def least_variances(parameters: Hyperparameters, points: Functionals, penalty: f
     return np.asarray(variances(parameters.kernel, points) * (_RESOLVED / penalty) * _ROUND_UP)
 
 
+def least_of_channels(solution: Solution) -> Array:
+    """(C,) least variances of the values of one output and of their rates, for a prior of 1."""
+    parameters = solution.hyperparameters
+    anywhere = Functionals(np.zeros((1, solution.centres.shape[1])))
+    penalty = parameters.lambda_covariance
+    if solution.representation == "low_rank":
+        penalty = min(penalty, parameters.lambda_mean)
+    least: Array = least_variances(parameters, anywhere, penalty)[0]
+    return least
+
+
 def resolved(parameters: Hyperparameters, points: Functionals, normals: Gaussians) -> Gaussians:
     """The normals of N points, with the least variance for exact outputs instead of 0, and for free
     ones one that hardly pulls.
     """
+    if not normals.has_limits:
+        return normals
     exact = normals.exact
     free = normals.free
-    if not (exact.any() or free.any()):
-        return normals
     penalty = min(parameters.lambda_mean, parameters.lambda_covariance)
     least = least_variances(parameters, points, penalty).repeat(parameters.channel_outputs, axis=1)
     least = least * np.tile(parameters.prior_variances, parameters.kernel.channels)

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from kmp.arrays.checks import Array, numbers, parts_of, real
 from kmp.arrays.linear_algebra import symmetric
-from kmp.gaussians import Gaussians, check_gaussians, fused_mean
+from kmp.gaussians import Gaussians, check_alike, fused_mean
 
 
 def superposed(references: Sequence[Gaussians], priorities: ArrayLike) -> Gaussians:
@@ -22,15 +22,8 @@ def superposed(references: Sequence[Gaussians], priorities: ArrayLike) -> Gaussi
     Raises ValueError if there is no reference, shapes do not agree, or a priority is below 0 or
     their sum is not 1.
     """
-    for i, reference in enumerate(parts_of("references", references)):
-        check_gaussians(f"references[{i}]", reference)
-    n, outputs = references[0].mean.shape
-    for i, other in enumerate(references):
-        if other.mean.shape != (n, outputs):
-            raise ValueError(
-                f"references[{i}]: means of shape {other.mean.shape} given, {(n, outputs)} needed."
-            )
-    g = _priorities(priorities, len(references), n)
+    check_alike("references", parts_of("references", references))
+    g = _priorities(priorities, len(references), len(references[0]))
     inverses = [np.linalg.inv(normals.covariance) for normals in references]
     precisions = [
         weight[:, None, None] * inverse for weight, inverse in zip(g, inverses, strict=True)

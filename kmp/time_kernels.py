@@ -16,7 +16,6 @@ import numpy as np
 from kmp.arrays.checks import Array, positive
 from kmp.arrays.immutable import frozen
 from kmp.composition import Composable
-from kmp.functionals import Derivatives
 from kmp.kernel import directed, unstretched
 
 
@@ -66,50 +65,13 @@ class _OneInput(Composable):
         )
         return np.where(along != 0, -bends * (along * stretch) ** 2, values)
 
-    @classmethod
-    def row(
-        cls,
-        offsets: Array,
-        values: Array,
-        scale: float,
-        derivatives: Derivatives | None = None,
-        order: int = 0,
-    ) -> Array:
-        """The derivative of this order of the row by x: (R,) if C is 1, else (C, R C)."""
-        r = offsets[:, 0]
-        blocks = cls.blocks(r, values, scale, order)
-        if derivatives is not None:
-            rows, along = derivatives
-            blocks[rows] = cls.blocks(r[rows], values[rows], scale, order + 1) * -along[:, :, None]
-        if cls.channels == 1:
-            return blocks.reshape(-1)
-        return np.ascontiguousarray(blocks.transpose(1, 0, 2)).reshape(cls.channels, -1)
-
-    @classmethod
-    def jacobian(
-        cls,
-        offsets: Array,
-        values: Array,
-        scale: float,
-        weight_rows: Array,
-        derivatives: Derivatives | None = None,
-    ) -> Array:
-        return np.asarray(
-            (cls.row(offsets, values, scale, derivatives, 1) @ weight_rows.T).reshape(-1, 1)
-        )
-
-    @classmethod
-    def curvature(
-        cls,
-        offsets: Array,
-        values: Array,
-        scale: float,
-        weights: Array,
-        direction: Array,
-        derivatives: Derivatives | None = None,
-    ) -> Array:
-        row = cls.row(offsets, values, scale, derivatives, 2)
-        return np.asarray((row @ weights).ravel() * float(direction @ direction))
+    def third(self, offsets: Array, along: Array, direction: Array) -> Array:
+        """As `kmp.kernel.third_derivative`."""
+        scale, stretch = self.coordinates(1)
+        r = offsets * stretch
+        blocks = self.blocks(r[:, 0], self.values(r, scale), scale, 3)
+        moved = along * stretch * (direction * stretch) ** 2  # (R, 1)
+        return np.asarray(blocks * moved[:, :, None])
 
 
 @dataclass(frozen=True)

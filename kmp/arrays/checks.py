@@ -183,22 +183,18 @@ def one_of(name: str, value: object, words: Sequence[str]) -> None:
         raise ValueError(f"{name}: {brief(value)} given, {', '.join(most)} or {last} needed.")
 
 
-def pair(name: str, demonstration: object) -> tuple[ArrayLike, ArrayLike]:
-    """Inputs and outputs of a demonstration. Raises ValueError unless it is a pair."""
-    if isinstance(demonstration, (tuple, list)) and len(demonstration) == 2:
-        return demonstration[0], demonstration[1]
-    of = f" of shape {demonstration.shape}" if isinstance(demonstration, np.ndarray) else ""
-    needed = "a pair needed: inputs (T, I) and outputs (T, O)"
-    raise ValueError(f"{name}: {type(demonstration).__name__}{of} given, {needed}.")
-
-
 def checked_demonstrations(
     demonstrations: Sequence[tuple[ArrayLike, ArrayLike]],
 ) -> list[tuple[Array, Array]]:
     """Inputs (T, I) and outputs (T, O) of each demonstration. Raises ValueError if one is empty."""
     data: list[tuple[Array, Array]] = []
     for h, demonstration in enumerate(parts_of("demonstrations", demonstrations)):
-        inputs, outputs = pair(f"demonstrations[{h}]", demonstration)
+        if not (isinstance(demonstration, (tuple, list)) and len(demonstration) == 2):
+            raise ValueError(
+                f"demonstrations[{h}]: {brief(demonstration)} given, a pair needed: inputs (T, I) "
+                "and outputs (T, O)."
+            )
+        inputs, outputs = demonstration
         i, o = (data[0][0].shape[1], data[0][1].shape[1]) if data else ("I", "O")
         s = numbers(f"demonstrations[{h}] inputs", inputs, "T", i)
         data.append((s, numbers(f"demonstrations[{h}] outputs", outputs, len(s), o)))

@@ -22,11 +22,12 @@ def kron_identity(blocks: Array, copies: int) -> Array:
     return np.asarray(wide.reshape(*stacked, rows * copies, columns * copies))
 
 
-def nearest_positive_semidefinite(covariance: Array) -> Array:
+def nearest_positive_semidefinite(covariance: Array, deviations: Array) -> Array:
     """The nearest positive semi-definite matrices (M, n, n), against eigenvalues rounded below 0.
 
     V max(diag(lambda), eps) V^T of the symmetric part V diag(lambda) V^T, with the machine's
-    precision eps, so that the result has a Cholesky factor (Higham 1988).
+    precision eps, so that the result has a Cholesky factor (Higham 1988). `deviations` (n,) are the
+    units in which rounding errors have the size eps.
     """
     covariance = symmetric(covariance)
     if len(covariance) == 1 and lapack.dpotrf(covariance[0])[1] == 0:
@@ -34,8 +35,9 @@ def nearest_positive_semidefinite(covariance: Array) -> Array:
     try:
         np.linalg.cholesky(covariance)
     except np.linalg.LinAlgError:
-        values, vectors = np.linalg.eigh(covariance)
+        unit = np.outer(deviations, deviations)
+        values, vectors = np.linalg.eigh(covariance / unit)
         raised = (vectors * np.maximum(values, _MACHINE)[:, None, :]) @ vectors.swapaxes(1, 2)
         below = (values[:, 0] < _MACHINE)[:, None, None]
-        covariance = np.where(below, symmetric(raised), covariance)
+        covariance = np.where(below, symmetric(raised) * unit, covariance)
     return covariance

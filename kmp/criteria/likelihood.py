@@ -1,22 +1,21 @@
 """Hyper-parameters of the greatest marginal likelihood of a reference, with one ell per input.
 
 mu ~ N(m, s^2 G) with G = K + lambda Sigma: -log p = (log det G + n (1 + log 2 pi s^2)) / 2 for the
-likeliest s^2 = (mu - m)^T G^-1 (mu - m) / n, n = N O. Rasmussen and Williams 2006, sections 5.1
-(automatic relevance determination) and 5.4.1 (gradient).
+likeliest s^2 = (mu - m)^T G^-1 (mu - m) / n, n = N O. Rasmussen and Williams 2006, section
+5.1 (automatic relevance determination).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Literal, NamedTuple
 
 import numpy as np
-from scipy.linalg import lapack
 
 from kmp.arrays.checks import Array
-from kmp.arrays.linear_algebra import kron_identity
-from kmp.kernel import Kernel, between
+from kmp.dense import Dense
+from kmp.kernel import Kernel
 from kmp.problem.database import Database
+from kmp.problem.hyperparameters import Hyperparameters
 from kmp.radial import GaussianKernel
 from kmp.time_kernels import VelocityKernel
 
@@ -60,20 +59,12 @@ def most_likely(
     lengths = {"each": len(first), "one": 1, "none": 0}[free]
 
     def parameters(x: Array) -> tuple[Kernel, float]:
-        ell = np.exp(first + x[:lengths]) if lengths else np.exp(first)
-        return with_ell(kernel, ell) if lengths else kernel, lambda_mean or float(
-            np.exp(penalty + x[lengths])
-        )
+        scaled = with_ell(kernel, np.exp(first + x[:lengths])) if lengths else kernel
+        return scaled, lambda_mean or float(np.exp(penalty + x[lengths]))
 
-    def target(x: Array) -> tuple[float, Array]:
+    def target(x: Array) -> float:
         likelihood = negative_log_likelihood(points, prior_mean, *parameters(x))
-        if likelihood is None:
-            return _UNLIKELY, np.zeros(len(x))
-        value, gradient, _ = likelihood
-        of_lengths = gradient[:-1] if free == "each" else gradient[:-1].sum(keepdims=True)
-        return value, np.concatenate(
-            [of_lengths[:lengths], gradient[-1:] if lambda_mean is None else []]
-        )
+        return _UNLIKELY if likelihood is None else likelihood[0]
 
     bounds = [_ELL_BOUNDS] * lengths + ([_LAMBDA_BOUNDS] if lambda_mean is None else [])
     best = np.zeros(len(bounds))
@@ -82,8 +73,8 @@ def most_likely(
         x = np.zeros(len(bounds))
         x[:lengths] = np.log(start)
         if bounds:
-            x = minimize(target, x, jac=True, method="L-BFGS-B", bounds=bounds).x
-        value, _ = target(x)
+            x = minimize(target, x, jac="3-point", method="L-BFGS-B", bounds=bounds).x
+        value = target(x)
         best, least = (x, value) if value < least else (best, least)
     likeliest, other = parameters(best)
     likelihood = negative_log_likelihood(points, prior_mean, likeliest, other)
@@ -92,68 +83,31 @@ def most_likely(
             "criterion: no likelihood to working precision. Give kernel and lambda_mean, or more "
             "regularization."
         )
-    return MostLikely(likeliest, other, likelihood[2])
+    return MostLikely(likeliest, other, likelihood[1])
 
 
 def negative_log_likelihood(
     points: Database, prior_mean: Array, kernel: Kernel, lambda_mean: float
-) -> tuple[float, Array, float] | None:
-    """-log p [nat] of the reference's means, its gradient, and the likeliest s^2.
+) -> tuple[float, float] | None:
+    """-log p [nat] of the reference's means, and the likeliest s^2.
 
-    The gradient (I + 1,) is by the log of each ell and by log lambda; (2,) with one ell for all
-    inputs. None if K + lambda Sigma is not positive definite.
+    None if K + lambda Sigma is not positive definite.
     """
-    reference = points.reference
-    c = kernel.channels
-    count, outputs = reference.mean.shape
-    d = outputs // c
-    every = np.arange(count)
-    k = between(kernel, points.functionals, points.functionals)
-    total = kron_identity(k, d)
-    total.reshape(count, outputs, count, outputs)[every, :, every, :] += (
-        lambda_mean * reference.covariance
-    )
-    factor, info = lapack.dpotrf(total.T, lower=1, clean=1, overwrite_a=1)
-    residual = (reference.mean - prior_mean).ravel()
-    weights = lapack.dpotrs(factor, residual, lower=1)[0]
-    signal = float(residual @ weights) / len(residual)
-    if info or not signal > 0:
+    slopes = np.zeros((len(prior_mean), points.inputs.shape[1]))
+    parameters = Hyperparameters(kernel, lambda_mean, lambda_mean, prior_mean, slopes)
+    solution = Dense(parameters, points)
+    try:
+        factor = solution.mean_factor
+    except ValueError:
         return None
-    log_det = 2 * np.log(np.diagonal(factor)).sum()
-    value = 0.5 * (log_det + len(residual) * (1 + np.log(2 * np.pi * signal)))
-    lower = lapack.dpotri(factor, lower=1)[0]
-    inverse = np.tril(lower) + np.tril(lower, -1).T
-    pull = (inverse - np.outer(weights, weights) / signal).reshape(count * c, d, count * c, d)
-    shared = np.einsum("idjd->ij", pull)  # twice the derivative of -log p by each entry of K
-    by_lengths = [
-        0.5 * float((shared * derivative).sum())
-        for derivative in _by_log_ell(kernel, points.inputs, k)
-    ]
-    diagonal_blocks = pull.reshape(count, outputs, count, outputs)[every, :, every, :]
-    by_lambda = 0.5 * lambda_mean * float((diagonal_blocks * reference.covariance).sum())
-    return float(value), np.array([*by_lengths, by_lambda]), signal
+    residual = (points.reference.mean - prior_mean).ravel()
+    signal = float(residual @ solution.weights.ravel()) / len(residual)
+    if not signal > 0:
+        return None
+    log_det = 2 * np.log(np.diagonal(factor)).sum() * (len(residual) / len(factor))
+    return float(0.5 * (log_det + len(residual) * (1 + np.log(2 * np.pi * signal)))), signal
 
 
 def with_ell(kernel: Kernel, ell: Array) -> Kernel:
     """A kernel of the same class with other ell (I,), or (1,)."""
     return VelocityKernel(float(ell[0])) if type(kernel) is VelocityKernel else GaussianKernel(ell)
-
-
-def _by_log_ell(kernel: Kernel, inputs: Array, k: Array) -> Iterator[Array]:
-    """dK / d log ell (N C, N C) for each ell."""
-    ell = np.atleast_1d(np.asarray(kernel.ell, dtype=np.float64))
-    if type(kernel) is GaussianKernel:
-        columns = inputs.T[:, :, None] if len(ell) > 1 or inputs.shape[1] == 1 else inputs[None]
-        for value, column in zip(ell, columns, strict=True):
-            yield -value * ((column[:, None] - column[None]) ** 2).sum(axis=2) * k
-    elif type(kernel) is VelocityKernel:
-        r = inputs - inputs.T
-        squares = ell[0] * r * r
-        blocks = k.reshape(len(r), 2, len(r), 2).copy()
-        value = blocks[:, 0, :, 0].copy()
-        blocks[:, 0, :, 0] *= -squares
-        blocks[:, 0, :, 1] *= 1 - squares
-        blocks[:, 1, :, 0] *= 1 - squares
-        # The rates' block is (2 ell - 4 ell^2 r^2) k.
-        blocks[:, 1, :, 1] = ell[0] * (2 - 8 * squares) * value - squares * blocks[:, 1, :, 1]
-        yield blocks.reshape(k.shape)

@@ -22,7 +22,6 @@ SCRIPTS = [
         "velocity",
         "uncertainty",
         "gains",
-        "kernels",
         "reach",
         "rhythm",
         "orientation",

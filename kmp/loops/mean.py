@@ -1,4 +1,4 @@
-"""Equation (8) and its Jacobian as compiled loops that vector units can execute.
+"""Equation (8) as compiled loops that vector units can execute.
 
 xi(s) = sum_r exp(-scale |x - x_r|^2) w_r + m(s) in the coordinates x = stretch * s.
 
@@ -144,7 +144,7 @@ def means(
 
     Returns true if all is finite. `places` (R',) are the indices of the centres that are
     derivatives along `along` (R', I); `coordinates` (1 + I,) the kernel's scale and the stretch of
-    each input; `prior` the prior mean's offset (O, 1), or offset and matrix (O, 1 + I).
+    each input; `prior` the prior mean's offset and matrix (O, 1 + I).
     """
     scale = coordinates[0]
     stretch = coordinates[1:]
@@ -161,54 +161,8 @@ def means(
         _derive(x, table, places, along, scale, values)
         for o in range(outputs):
             mean = sum_products(values, table[inputs + o]) + prior[o, 0]
-            for i in range(prior.shape[1] - 1):
+            for i in range(inputs):
                 mean += prior[o, 1 + i] * queries[m, i]
             out[m, o] = mean
             total += mean
-    return math.isfinite(total)
-
-
-@compiled
-def slopes(
-    query: Array,
-    table: Array,
-    places: NDArray[np.intp],
-    along: Array,
-    coordinates: Array,
-    prior: Array,
-    out: Array,
-) -> bool:
-    """Write dxi/ds at a query (I,) to `out` (O, I); true if all is finite. See `means`."""
-    scale = coordinates[0]
-    stretch = coordinates[1:]
-    outputs = len(prior)
-    total = 0.0
-    inputs = len(stretch)
-    padded = table.shape[1]
-    x = query * stretch
-    values = np.empty(padded)
-    pull = np.empty(padded)
-    offsets = np.empty((inputs, padded))
-    _kernel_values(x, table, scale, values, pull)
-    out[:] = 0.0
-    for n in range(len(places)):
-        for o in range(outputs):
-            share = values[places[n]] * table[inputs + o, places[n]]
-            for i in range(inputs):
-                out[o, i] -= share * along[n, i]
-    _derive(x, table, places, along, scale, values)
-    for i in range(inputs):
-        coordinate = x[i]
-        centres = table[i]
-        offset = offsets[i]
-        for r in range(len(values)):
-            offset[r] = coordinate - centres[r]
-    for o in range(outputs):
-        weights = table[inputs + o]
-        for r in range(len(values)):
-            pull[r] = values[r] * weights[r]
-        for i in range(inputs):
-            slope = -2.0 * scale * (out[o, i] + sum_products(pull, offsets[i])) * stretch[i]
-            out[o, i] = slope + prior[o, 1 + i] if prior.shape[1] > 1 else slope
-            total += out[o, i] + x[i]
     return math.isfinite(total)

@@ -19,9 +19,8 @@ from kmp.arrays.immutable import Immutable, frozen
 from kmp.arrays.linear_algebra import nearest_positive_semidefinite
 from kmp.compiled import AVAILABLE, compiled
 from kmp.dense import Dense
-from kmp.functionals import Derivatives
 from kmp.loops.kernel_row import kernel_value
-from kmp.loops.mean import means, slopes, table_of
+from kmp.loops.mean import means, table_of
 from kmp.query import MotionPrediction, Query
 from kmp.radial import GaussianKernel
 
@@ -35,37 +34,38 @@ class CompiledQuery(Immutable):
     """The arrays of a query for compiled loops. R centres, O outputs."""
 
     query: Query
+    scale: float
+    stretch: Array
+    """(I,) x = stretch * s are the kernel's coordinates."""
     rows: Array
     """(R, I + O) each centre, in the kernel's coordinates, and its weights."""
+    table: Array
+    """(I + O, P) the rows transposed and padded, for `means`."""
     along: Array
     """(R, I) the directions of derivatives, in the kernel's coordinates, zero for a value; (0, I)
     if all are values."""
-    table: Array
-    """(I + O, P) the rows transposed and padded, for `means`."""
-    derivatives: Derivatives
-    """The centres that are derivatives."""
+    places: NDArray[np.intp]
+    """(R',) the centres that are derivatives."""
 
     @classmethod
     def of(cls, query: Query) -> CompiledQuery | None:
         """The query for compiled loops; None without Numba, or for another kernel."""
-        if not AVAILABLE or type(query.kernel) is not GaussianKernel:
+        kernel = query.kernel
+        if not AVAILABLE or type(kernel) is not GaussianKernel:
             return None
-        inputs = len(query.stretch)
-        nothing = frozen(np.empty((0, inputs)))
-        none: NDArray[np.intp] = frozen(np.empty(0, dtype=np.intp))
-        along = (
-            frozen(query.solution.functionals.along * query.stretch)
-            if query.derivatives
-            else nothing
-        )
-        rows = np.hstack([query.centres, query.weights])
-        table = table_of(query.centres, query.weights)
+        functionals = query.solution.functionals
+        scale, stretch = kernel.coordinates(functionals.inputs.shape[1])
+        centres = functionals.inputs * stretch
+        along = functionals.along * stretch
+        places = np.flatnonzero(~functionals.values)
         return cls(
             query,
-            frozen(rows),
-            along,
-            frozen(table),
-            query.derivatives or Derivatives(none, nothing),
+            scale,
+            stretch,
+            frozen(np.hstack([centres, query.weights])),
+            frozen(table_of(centres, query.weights)),
+            frozen(along if len(places) else along[:0]),
+            frozen(places),
         )
 
     @cached_property
@@ -75,14 +75,14 @@ class CompiledQuery(Immutable):
         L (R A, R A) with L L^T = K + lambda_c Sigma. None if the solution is not dense.
         """
         solution = self.query.solution
-        return _packed(self.query, solution) if isinstance(solution, Dense) else None
+        return self._packed(solution) if isinstance(solution, Dense) else None
 
     @cached_property
     def _reads(self) -> tuple[Array, NDArray[np.intp], Array, Array, Array]:
-        """The arguments of `means` and `slopes` other than the queries."""
-        q = self.query
-        coordinates = frozen(np.concatenate([[q.scale], q.stretch]))
-        return self.table, *self.derivatives, coordinates, q.prior_mean
+        """The arguments of `means` other than the queries."""
+        coordinates = frozen(np.concatenate([[self.scale], self.stretch]))
+        directions = frozen(self.along[self.places])
+        return self.table, self.places, directions, coordinates, self.query.prior_mean
 
     def mean(self, queries: Array) -> tuple[Array, Array] | None:
         """xi (M, O) at M >= 1 queries (M, I), and the last query's kernel row (R,).
@@ -97,13 +97,6 @@ class CompiledQuery(Immutable):
         finite = means(query_array, table, places, along, coordinates, prior, values, out)
         return (out, values[: len(self.rows)]) if finite else None
 
-    def jacobian(self, query: Array) -> Array | None:
-        """As `Query.jacobian`, to rounding; None as in `mean`."""
-        table, places, along, coordinates, prior = self._reads
-        query_array = np.array(query, np.float64, order="C")
-        out = np.empty((len(prior), len(query_array)))
-        return out if slopes(query_array, table, places, along, coordinates, prior, out) else None
-
     def motion(
         self, query: Array, velocity: Array, acceleration: Array, *, covariance: bool
     ) -> MotionPrediction | None:
@@ -116,7 +109,7 @@ class CompiledQuery(Immutable):
         moving[2] = acceleration
         out = np.empty((MEANS + len(query), len(q.prior_mean)))
         if not _motion(
-            moving, self.rows, self.along, q.stretch, q.scale, q.prior_mean, values, out
+            moving, self.rows, self.along, self.stretch, self.scale, q.prior_mean, values, out
         ):
             return None
         posterior = self.covariance(values) if covariance else None
@@ -134,26 +127,21 @@ class CompiledQuery(Immutable):
         if not _posterior(
             values, self.columns, np.zeros((distinct, len(values) * distinct)), posterior
         ):
-            posterior = nearest_positive_semidefinite(posterior[None])[0]
+            unit = q.solution.hyperparameters.prior_deviations[:distinct]
+            posterior = nearest_positive_semidefinite(posterior[None], unit)[0]
         posterior *= q.covariance_scale
         return posterior if distinct > 1 else posterior[0, 0] * np.eye(len(q.prior_mean))
 
-
-def _packed(query: Query, solution: Dense) -> Array:
-    a = solution.distinct
-    size = len(query.centres) * solution.distinct
-    inverse = np.empty((size, size))
-    noise = (
-        solution.hyperparameters.lambda_covariance
-        * solution.database.reference.covariance[:, :a, :a]
-    )
-    is_exact = size <= _MOST_EXACT and not query.derivatives
-    if not (
-        is_exact
-        and _inverse_factor(np.ascontiguousarray(query.centres), query.scale, noise, inverse)
-    ):
-        inverse, _ = lapack.dtrtri(solution.covariance_factor, lower=1)
-    return frozen(np.concatenate([inverse[i - i % a :, i] for i in range(len(inverse))]))
+    def _packed(self, solution: Dense) -> Array:
+        a = solution.distinct
+        inverse = np.empty((len(self.rows) * a, len(self.rows) * a))
+        centres = np.ascontiguousarray(self.rows[:, : len(self.stretch)])
+        penalty = solution.hyperparameters.lambda_covariance
+        noise = penalty * solution.database.reference.covariance[:, :a, :a]
+        is_exact = len(inverse) <= _MOST_EXACT and not len(self.places)
+        if not (is_exact and _inverse_factor(centres, self.scale, noise, inverse)):
+            inverse, _ = lapack.dtrtri(solution.covariance_factor, lower=1)
+        return frozen(np.concatenate([inverse[i - i % a :, i] for i in range(len(inverse))]))
 
 
 @compiled
@@ -204,7 +192,7 @@ def _inverse_factor(centres: Array, scale: float, noise: Array, out: Array) -> b
 
 
 @compiled
-def _motion(  # noqa: C901, PLR0912, PLR0915 - one nest of loops
+def _motion(  # noqa: C901, PLR0912 - one nest of loops
     moving: Array,
     rows: Array,
     along: Array,
@@ -217,13 +205,12 @@ def _motion(  # noqa: C901, PLR0912, PLR0915 - one nest of loops
     """Equation (8) and its derivatives along a motion, in one pass over the centres.
 
     Returns true if all is finite. `moving` (3, I) is the query, its velocity and acceleration;
-    `prior` the prior mean's offset (O, 1), or offset and matrix (O, 1 + I). Writes the kernel row
+    `prior` the prior mean's offset and matrix (O, 1 + I). Writes the kernel row
     to `values` (R,), and mean, velocity, acceleration, curvature, Jacobian to `out` (4 + I, O).
     """
     inputs = len(stretch)
     outputs = len(prior)
     derivatives = len(along) > 0
-    affine = prior.shape[1] > 1
     query = np.empty(inputs)
     offset = np.empty(inputs)
     direction = np.empty(inputs)
@@ -275,9 +262,8 @@ def _motion(  # noqa: C901, PLR0912, PLR0915 - one nest of loops
         pushed[o] = curvature[o]
         for i in range(inputs):
             jacobian[o, i] *= stretch[i]
-            if affine:
-                jacobian[o, i] += prior[o, 1 + i]
-                mean[o] += prior[o, 1 + i] * moving[0, i]
+            jacobian[o, i] += prior[o, 1 + i]
+            mean[o] += prior[o, 1 + i] * moving[0, i]
             moved[o] += jacobian[o, i] * moving[1, i]
             pushed[o] += jacobian[o, i] * moving[2, i]
         total += mean[o] + moved[o] + pushed[o]

@@ -5,7 +5,7 @@ k(s, s') = z(s)^T z(s') + residual with features z (r,), so xi(s) = W^T z(s) wit
 via-points. Fine and Scheinberg 2001; Rasmussen and Williams 2006, sections 8.1 and 8.3.
 """
 
-from kmp.low_rank.features import Features
+from kmp.low_rank.features import FLOOR, Features
 from kmp.low_rank.solution import RANK, TOLERANCE, LowRank
 
-__all__ = ["RANK", "TOLERANCE", "Features", "LowRank"]
+__all__ = ["FLOOR", "RANK", "TOLERANCE", "Features", "LowRank"]

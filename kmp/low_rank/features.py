@@ -23,7 +23,7 @@ KEPT = 50_000_000  # features kept in memory, 400 MB; larger ones are computed a
 _CANDIDATES = 4096  # pivots are chosen among this number of inputs
 _ROUNDS = 6  # rounds of adding pivots where the residual exceeds the tolerance
 _MARGIN = 0.25  # the candidates must meet this share of the tolerance, so that other inputs meet it
-_FLOOR = 1e-14  # a residual below this share of k(s, s) is rounding
+FLOOR = 1e-14  # a residual below this share of k(s, s) is rounding
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -132,7 +132,7 @@ class Features(Immutable):
     def residual_of(self, points: Functionals, z: Array) -> Array:
         """The residual (n, C), of n points whose features (r, n C) are known."""
         shares = 1 - (z * z).sum(axis=0).reshape(len(points), -1) / variances(self.kernel, points)
-        return np.asarray(np.maximum(shares, _FLOOR))
+        return np.asarray(np.maximum(shares, FLOOR))
 
 
 def _columns(rows: Array, channels: NDArray[np.intp], kernel: Kernel) -> Array:

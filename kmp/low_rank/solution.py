@@ -27,7 +27,6 @@ from kmp.arrays.immutable import frozen
 from kmp.arrays.inverse_cholesky import InverseCholeskyFactor
 from kmp.arrays.linear_algebra import kron_identity
 from kmp.functionals import Functionals
-from kmp.gaussians import Gaussians
 from kmp.kernel import between
 from kmp.low_rank.features import BLOCK, KEPT, Features
 from kmp.problem.database import Changes, Database
@@ -54,8 +53,6 @@ class LowRank(Expansion):
     information: Array
     """(r D, r D) sum_n z_n^T z_n (x) Sigma_n^-1, which does not depend on lambda."""
     w: Array  # W (r, D), the weights of the features
-    base: LowRank | None = None
-    """The solution before adaptation, if so many points changed that this one is a new fit."""
 
     representation: ClassVar[Literal["low_rank"]] = "low_rank"
 
@@ -65,7 +62,6 @@ class LowRank(Expansion):
         hyperparameters: Hyperparameters,
         database: Database,
         features: Features,
-        base: LowRank | None = None,
         *,
         values: Sequence[Array] = (),
     ) -> LowRank:
@@ -102,7 +98,7 @@ class LowRank(Expansion):
                 pulls = (precision[block] @ residual[:, :, None]).reshape(-1, c, d)
                 pull += np.tensordot(z(block.start), pulls, axes=([0, 1], [0, 1]))
             w = w + lapack.dpotrs(factor, pull.ravel(), lower=1)[0].reshape(r, d)
-        fitted = cls(hyperparameters, database, features, information, frozen(w), base)
+        fitted = cls(hyperparameters, database, features, information, frozen(w))
         return fitted._with_cached(mean_factor=factor)
 
     @classmethod
@@ -169,30 +165,27 @@ class LowRank(Expansion):
         )
 
     def adapted(self, changes: Changes) -> LowRank | Conditioned:
-        """The base's solution conditioned on these changes, or a new fit if they are many."""
-        base = self.base or self
+        """The solution conditioned on these changes, or a new fit if they are many."""
+        kernel = self.features.kernel
         changed = len(changes.replaced) + len(changes.inputs)
-        if changed * base.features.kernel.channels <= len(base.centres):
-            return Conditioned(base, changes)
+        if changed * kernel.channels <= len(self.centres):
+            return Conditioned(self, changes)
         # Conditioning on more changes than features costs more, and loses more digits, than a fit.
-        database = base.database.changed(changes)
-        rank = max(RANK, len(base.centres) + len(changes.inputs) * base.features.kernel.channels)
-        features, _ = Features.of(
-            base.features.kernel, database.functionals, rank=rank, tolerance=TOLERANCE
-        )
-        return LowRank.fit(self.hyperparameters, database, features, base)
+        database = self.database.changed(changes)
+        rank = max(RANK, len(self.centres) + len(changes.inputs) * kernel.channels)
+        features, _ = Features.of(kernel, database.functionals, rank=rank, tolerance=TOLERANCE)
+        return LowRank.fit(self.hyperparameters, database, features)
 
     def with_hyperparameters(self, hyperparameters: Hyperparameters) -> LowRank:
         return LowRank(hyperparameters, self.database, self.features, self.information, self.w)
 
     def to_arrays(self) -> dict[str, NDArray[np.float64]]:
-        """The pivots, the information matrix and W of the base."""
-        base = self.base or self
-        arrays = {"pivots": base.centres, "information": base.information, "features": base.w}
-        if base.functionals.directions is not None:
-            arrays["pivot_directions"] = base.functionals.directions
-        if base.features.kernel.channels > 1:
-            arrays["pivot_channels"] = base.features.channels.astype(np.float64)
+        """The pivots, the information matrix and W."""
+        arrays = {"pivots": self.centres, "information": self.information, "features": self.w}
+        if self.functionals.directions is not None:
+            arrays["pivot_directions"] = self.functionals.directions
+        if self.features.kernel.channels > 1:
+            arrays["pivot_channels"] = self.features.channels.astype(np.float64)
         return arrays
 
     def whitened_one(self, row: Array) -> tuple[Array, Array]:
@@ -349,15 +342,6 @@ class Conditioned(Expansion):
         z, roots = self.base.whitened(rows)
         return self._posterior_covariance(rows.reshape(len(z), z.shape[2], -1), z, roots)
 
-    def adapted(self, changes: Changes) -> LowRank | Conditioned:
-        return self.base.adapted(changes)
-
-    def with_hyperparameters(self, hyperparameters: Hyperparameters) -> Conditioned:
-        return Conditioned(self.base.with_hyperparameters(hyperparameters), self.changes)
-
-    def to_arrays(self) -> dict[str, NDArray[np.float64]]:
-        return self.base.to_arrays()
-
     @property
     def _added(self) -> int:
         return len(self.changes.inputs)
@@ -369,13 +353,7 @@ class Conditioned(Expansion):
     @cached_property
     def _points(self) -> Database:
         """The U changed points, those added first."""
-        database = self.base.database
-        replaced = self.changes.replaced
-        functionals = Functionals.concatenated(
-            [self.changes.functionals, database.functionals.take(replaced)]
-        )
-        normals = Gaussians.concatenated([self.changes.points, database.reference.take(replaced)])
-        return Database(functionals, normals)
+        return self._added_points.joined(self.base.database.take(self.changes.replaced))
 
     @cached_property
     def _z(self) -> Array:

@@ -20,11 +20,12 @@ from kmp.arrays.immutable import Immutable, frozen
 from kmp.functionals import Functionals
 from kmp.gaussians import Gaussians
 from kmp.kernel import Kernel, variances
+from kmp.problem.hyperparameters import Hyperparameters
 
 DISTANCES = 10_000_000  # distances computed at once, which bounds the memory to 80 MB
 _PAIR = 2  # a distance needs two points
 _MISSED_DEVIATIONS = 3.0  # a via-point is missed beyond this multiple of its deviation
-_MISSED_DISTANCE = 1e-3  # [unit of the outputs] smaller errors are not reported: 1 mm in metres
+_MISSED_SHARE = 1e-3  # smaller errors, as a share of the prior deviation, are not reported
 _NAMED = 5  # a message names at most this many via-points
 
 
@@ -58,8 +59,6 @@ class Changes(NamedTuple):
 class Database(Immutable):
     """N reference points: functionals of the output, and a normal distribution of each."""
 
-    _not_pickled = frozenset({"_known_shares"})
-
     functionals: Functionals  # N
     reference: Gaussians  # N
 
@@ -72,22 +71,28 @@ class Database(Immutable):
         return self.functionals.inputs
 
     def least_shares(self, kernel: Kernel) -> Array:
-        """The least eigenvalue (N,) of each Sigma_n, as a share of k(s_n, s_n) of its channel.
+        """The least eigenvalue (N,) of each Sigma_n, as a share of k(s_n, s_n) of its channel."""
+        scale = np.sqrt(self._variances(kernel))
+        shares = self.reference.covariance / (scale[:, :, None] * scale[:, None, :])
+        return np.asarray(np.linalg.eigvalsh(shares)[:, 0])
 
-        Of S^-1 Sigma_n S^-1, where S^2 is the diagonal of k(s_n, s_n). The last kernel's are kept.
-        """
-        cached: tuple[Kernel, Array] | None = self.__dict__.get("_known_shares")
-        if cached is None or cached[0] is not kernel:
-            repeats = self.reference.outputs // kernel.channels
-            scale = np.sqrt(variances(kernel, self.functionals)).repeat(repeats, axis=1)
-            covariance = self.reference.covariance / (scale[:, :, None] * scale[:, None, :])
-            cached = kernel, frozen(np.linalg.eigvalsh(covariance)[:, 0])
-            self.__dict__["_known_shares"] = cached
-        return cached[1]
+    def exceeds(self, kernel: Kernel, share: float) -> bool:
+        """True if all `least_shares` are above this one."""
+        least = share * self._variances(kernel)
+        identity = np.eye(self.reference.outputs)
+        try:
+            np.linalg.cholesky(self.reference.covariance - least[:, :, None] * identity)
+        except np.linalg.LinAlgError:
+            return False
+        return True
 
-    def since(self, first: int) -> Database:
-        """The points from index `first` on."""
-        chosen = slice(first, None)
+    def _variances(self, kernel: Kernel) -> Array:
+        """The diagonal (N, O) of k(s_n, s_n) (x) I."""
+        outputs = self.reference.outputs // kernel.channels
+        return np.asarray(variances(kernel, self.functionals).repeat(outputs, axis=1))
+
+    def take(self, chosen: NDArray[np.intp] | slice) -> Database:
+        """The chosen points."""
         return Database(self.functionals.take(chosen), self.reference.take(chosen))
 
     def joined(self, other: Database) -> Database:
@@ -154,25 +159,26 @@ def _distances(a: Array, b: Array, period: float | None) -> Array:
     return np.asarray(np.minimum(r, period - r))
 
 
-def warn_of_missed(desired: Gaussians, mean: Array, channels: int) -> None:
+def warn_of_missed(desired: Gaussians, mean: Array, parameters: Hyperparameters) -> None:
     """Warn of the desired points that the mean (V, O) misses.
 
-    The error r of a channel is a miss if |r| > 0.001 and sqrt(r^T Sigma^-1 r) > 3.
+    The error r of a channel is a miss if |r / prior deviation| > 0.001 and sqrt(r^T Sigma^-1 r) >
+    3.
     """
-    count = len(mean)
-    d = desired.outputs // channels
-    residual = (desired.mean - mean).reshape(count, channels, d)
-    distance = np.sqrt((residual * residual).sum(axis=2))  # (V, C)
-    if not (distance > _MISSED_DISTANCE).any():
+    channels = parameters.kernel.channels
+    d = parameters.channel_outputs
+    residual = (desired.mean - mean).reshape(len(mean), channels, d)
+    units = parameters.prior_deviations.reshape(channels, d)
+    is_far = np.linalg.norm(residual / units, axis=2) > _MISSED_SHARE  # (V, C)
+    if not is_far.any():
         return
+    distance = np.linalg.norm(residual, axis=2)
     missed = []
     for c in range(channels):
         block = desired.covariance[:, c * d : (c + 1) * d, c * d : (c + 1) * d]
         pull = np.linalg.solve(block, residual[:, c, :, None])[:, :, 0]
         deviations = np.sqrt(np.vecdot(residual[:, c], pull))
-        for n in np.flatnonzero(
-            (distance[:, c] > _MISSED_DISTANCE) & (deviations > _MISSED_DEVIATIONS)
-        ):
+        for n in np.flatnonzero(is_far[:, c] & (deviations > _MISSED_DEVIATIONS)):
             missed.append(f"{n} by {distance[n, c]:.3g} ({deviations[n]:.3g} deviations)")
     if missed:
         more = f" and {len(missed) - _NAMED} more" if len(missed) > _NAMED else ""
@@ -182,5 +188,5 @@ def warn_of_missed(desired: Gaussians, mean: Array, channels: int) -> None:
             "via-point less variance, replace what is near by a larger tolerance, or take a "
             "larger ell.",
             ViaPointMissed,
-            stacklevel=3,
+            stacklevel=4,
         )

@@ -50,7 +50,7 @@ class Hyperparameters(Immutable):
     lambda_mean: float
     lambda_covariance: float
     prior_offset: Array  # (O,) [unit of the outputs]
-    prior_matrix: Array | None = None  # (O, I) where the prior mean is affine
+    prior_matrix: Array  # (O, I), zero unless the prior mean is affine
     # B (D, D) [unit of the outputs^2] of the outputs of a channel; None: the identity
     prior_covariance: Array | None = None
 
@@ -84,21 +84,18 @@ class Hyperparameters(Immutable):
                     "alone."
                 )
         else:
-            matrix = None
-            offset = numbers(
-                "prior_mean", np.zeros(outputs) if prior_mean is None else prior_mean, outputs
-            )
+            matrix = frozen(np.zeros((outputs, inputs)))
+            offset = frozen(np.zeros(outputs))
+            if prior_mean is not None:
+                offset = numbers("prior_mean", prior_mean, outputs)
+        values = outputs // kernel.channels
         if kernel.channels > 1:
-            values = outputs // kernel.channels
-            slopes, of_rates = (
-                (np.zeros(values), 0.0) if matrix is None else (matrix[:values, 0], matrix[values:])
-            )
-            if not np.array_equal(rates := offset[values:], slopes) or np.any(of_rates):
+            slopes = matrix[:values, 0]
+            if not np.array_equal(rates := offset[values:], slopes) or matrix[values:].any():
                 raise ValueError(
                     f"prior_mean: rates of {brief(rates)} given, {brief(slopes)} needed: those of "
                     "the values' prior mean."
                 )
-        values = outputs // kernel.channels
         return cls(kernel, penalty, other, offset, matrix, _covariance(prior_covariance, values))
 
     @cached_property
@@ -112,6 +109,12 @@ class Hyperparameters(Immutable):
         correlation = self.prior_covariance / np.sqrt(np.outer(variances, variances))
         return np.asarray(variances * np.linalg.eigvalsh(correlation)[-1])
 
+    @cached_property
+    def prior_deviations(self) -> Array:
+        """(O,) [unit of the outputs] the roots of k(s, s) (x) B's diagonal."""
+        variances = np.diagonal(self.over_outputs(self.kernel.prior_variance))
+        return frozen(np.sqrt(variances))
+
     def over_outputs(self, blocks: Array) -> Array:
         """x (x) B of blocks (..., C, C): (..., O, O)."""
         wide = kron_identity(blocks, self.channel_outputs)
@@ -122,38 +125,22 @@ class Hyperparameters(Immutable):
     @property
     def prior_mean(self) -> Array | AffineMean:
         """(O,) [unit of the outputs], or an `AffineMean` that depends on the input."""
-        return (
-            self.prior_offset
-            if self.prior_matrix is None
-            else AffineMean(self.prior_matrix, self.prior_offset)
-        )
+        if not self.prior_matrix.any():
+            return self.prior_offset
+        return AffineMean(self.prior_matrix, self.prior_offset)
 
     @cached_property
     def prior_columns(self) -> Array:
-        """The offset (O, 1), or the offset and the matrix side by side (O, 1 + I)."""
-        offset = self.prior_offset[:, None]
-        return frozen(
-            np.array(offset)
-            if self.prior_matrix is None
-            else np.hstack([offset, self.prior_matrix])
-        )
+        """The offset and the matrix side by side (O, 1 + I)."""
+        return frozen(np.hstack([self.prior_offset[:, None], self.prior_matrix]))
 
     def prior_at(self, points: Functionals) -> Array:
-        """The prior mean of N functionals: (N, O), or (O,) if it is the same for all.
-
-        A derivative along v has A v.
-        """
-        offset = (
-            self.prior_offset
-            if points.directions is None
-            else points.values[:, None] * self.prior_offset
-        )
-        if self.prior_matrix is None:
-            return offset
-        moved = points.inputs
-        if points.directions is not None:
-            moved = np.where(points.values[:, None], moved, points.directions)
-        return np.asarray(moved @ self.prior_matrix.T + offset)
+        """The prior mean (N, O) of N functionals. A derivative along v has A v."""
+        if points.directions is None:
+            return np.asarray(points.inputs @ self.prior_matrix.T + self.prior_offset)
+        values = points.values[:, None]
+        moved = np.where(values, points.inputs, points.along)
+        return np.asarray(moved @ self.prior_matrix.T + values * self.prior_offset)
 
     @property
     def outputs(self) -> int:

@@ -163,6 +163,20 @@ def test_missed_via_point_is_named():
     assert f"1 by {miss[1]:.3g} ({miss[1] / 0.01:.3g} deviations)" in str(caught[0].message)
 
 
+@pytest.mark.parametrize("unit", [1e-6, 1e6])
+def test_miss_is_over_the_prior_deviation(unit):
+    times = np.linspace(0, 1, 20)[:, None]
+    primitive = KMP.fit(
+        times,
+        Gaussians.of(unit * times, deviation=0.1 * unit),
+        kernel=GaussianKernel(1.0),
+        lambda_mean=1.0,
+        prior_covariance=[unit**2],
+    )
+    with pytest.warns(ViaPointMissed, match="0 by .* deviations"):
+        primitive.adapt([0.5, 0.501], Gaussians.of([[unit], [-unit]], deviation=0.01 * unit))
+
+
 def test_small_miss_is_not_named():
     """A via-point that may be missed, or is missed by less than a millimetre, is not named."""
     near = np.array([[0.0, 0, 0, 0], [0.01, 0, 0, 0]])

@@ -63,7 +63,8 @@ query = KMP.fit(s, reference, kernel=GaussianKernel(0.5), lambda_mean=1.0).inner
 from kmp.loops.query import CompiledQuery
 rounded = np.round(query.weights, 6)  # solved by LAPACK, which is another on such a CPU
 loops = CompiledQuery.of(replace(query, weights=rounded))
-print(loops.mean(s + 0.1)[0].tobytes().hex(), loops.jacobian(s[0]).tobytes().hex())
+motion = loops.motion(*s[:3], covariance=False)
+print(loops.mean(s + 0.1)[0].tobytes().hex(), motion.jacobian.tobytes().hex())
 """
 
 

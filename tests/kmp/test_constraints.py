@@ -46,6 +46,13 @@ def test_constraints_are_obeyed():
         )
 
 
+def test_constraint_is_no_data():
+    """Beyond the data, a constraint does not make a skill more certain."""
+    far = LinearConstraints([[4.0]], [[1.0, 0.0]], [2.0])
+    expected = base().uncertainty([4.0]).distance
+    np.testing.assert_allclose(base().constrained(far).uncertainty([4.0]).distance, expected)
+
+
 def test_mean_has_least_cost():
     """The mean has the least cost among those that satisfy the constraints."""
     few = LinearConstraints(WHERE[::5], np.tile([0.0, 1.0], (9, 1)), np.full(9, -0.2))

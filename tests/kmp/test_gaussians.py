@@ -67,6 +67,14 @@ def test_invalid_covariance_is_refused(second, says):
         Gaussians(np.zeros((2, 2)), [np.eye(2), second])
 
 
+def test_any_sizes_of_outputs_are_allowed():
+    """Correlations decide whether a covariance is positive definite."""
+    sizes = np.array([1e9, 1.0, 1e-9])
+    covariance = np.outer(sizes, sizes) * (np.eye(3) + 0.5)
+    checked = Gaussians(np.zeros((1, 3)), covariance[None]).covariance[0]
+    np.testing.assert_array_equal(checked, covariance)
+
+
 @properties
 @given(seeds)
 def test_affine_map_and_inverse_cancel(seed):

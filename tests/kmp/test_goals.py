@@ -87,6 +87,42 @@ def test_goal_jacobian_is_that_of_any_goal():
     assert of.goal_jacobian(QUERIES).shape == (len(QUERIES), 2, 0, 2)
 
 
+@pytest.mark.parametrize("representation", ["dense", "low_rank"])
+def test_exact_goals_near_each_other(representation):
+    of = primitive(representation)
+    via = [[0.5], [0.501]]
+    alternatives = of.adapt_many(
+        [(via, Gaussians.of(np.full((2, 2), float(n)), deviation=0)) for n in range(3)]
+    )
+    expected = [each.mean(QUERIES) for each in alternatives]
+    np.testing.assert_allclose(alternatives.mean(QUERIES), expected, atol=1e-7)
+
+
+def test_goals_without_via_points_or_lost_in_rounding():
+    adapted = primitive().adapt([[1.0]], Gaussians.of([0.5, 0.5], deviation=0.01))
+    nothing = np.empty((0, 1)), Gaussians.of(np.empty((0, 2)), deviation=0.1)
+    means = adapted.adapt_many([nothing, nothing]).mean(QUERIES)
+    np.testing.assert_allclose(means, [adapted.mean(QUERIES)] * 2, atol=1e-12)
+    lost = adapted.adapt_many(goals(adapted, OTHER, deviation=1e-9))
+    with pytest.raises(ValueError, match="would be lost in rounding"):
+        lost.mean(QUERIES)
+
+
+@pytest.mark.parametrize("size", [1e-9, 1e9])
+def test_goal_jacobian_of_any_unit(size):
+    def jacobian(unit):
+        skill = KMP.fit(
+            INPUTS,
+            Gaussians.of(unit * np.sin(3 * INPUTS), deviation=0.1 * unit),
+            kernel=GaussianKernel(6.0),
+            lambda_mean=1.0,
+            prior_covariance=[unit**2],
+        )
+        return skill.adapt([0.5], Gaussians.of([unit], deviation=0)).goal_jacobian(QUERIES)
+
+    np.testing.assert_allclose(jacobian(size), jacobian(1.0), atol=1e-10)
+
+
 def test_goal_jacobian_with_constraints_is_refused():
     bound = LinearConstraints([[1.0]], [[1.0, 0.0]], [0.5])
     with pytest.raises(ValueError, match="goal_jacobian: a primitive with constraints"):

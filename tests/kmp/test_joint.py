@@ -71,6 +71,28 @@ def test_jacobians_are_those_of_one_by_one(skill):
     assert skill.jacobians(QUERIES[:0]).shape == (0, 2, 1)
 
 
+@pytest.mark.parametrize("size", [(1e-9, 1e-9), (1.0, 1e-9)])
+def test_small_outputs_scale(size):
+    """Covariances, their causes and samples are those of outputs of size 1."""
+    queries = np.linspace(0, 2, 60)[:, None]
+
+    def scaled(unit):
+        reference = Gaussians.of(unit * np.hstack([np.sin(2 * T), np.cos(T)]), deviation=0.1 * unit)
+        prior = np.square(unit)
+        skill = KMP.fit(
+            T, reference, kernel=KERNELS["gaussian"], lambda_mean=1, prior_covariance=prior
+        )
+        causes = skill.uncertainty(queries)
+        joint = np.diagonal(skill.predict_joint(queries).covariance[0]).reshape(-1, 2)
+        variances = [joint, *np.diagonal([causes.variability, causes.distance], axis1=2, axis2=3)]
+        spread = skill.sample(queries, 400).std(axis=0)
+        return [variance / prior for variance in variances], spread / unit
+
+    (expected, spread), (variances, scaled_spread) = scaled(np.ones(2)), scaled(np.array(size))
+    np.testing.assert_allclose(variances, expected, atol=1e-9)
+    np.testing.assert_allclose(scaled_spread, spread, rtol=0.2)
+
+
 @pytest.mark.parametrize("representation", ["dense", "low_rank"])
 def test_a_rhythmic_skill_has_no_seam(representation):
     phase = np.linspace(0, 2 * np.pi, 60, endpoint=False)[:, None]

@@ -198,6 +198,15 @@ def test_dense_where_rounding_would_hide():
         KMP.fit(t, exact, representation="low_rank", **options)
 
 
+def test_few_points_are_solved_exactly():
+    """Near to each other, each has a feature of its own."""
+    times = np.array([[0.01], [0.08], [0.11]])
+    reference = Gaussians.of(np.array([[1.4, 5.0], [-0.3, -3.0], [1.2, -9.0]]), deviation=0.2)
+    dense, low = of_both(times, reference, kernel=VelocityKernel(2.6), lambda_mean=0.5)
+    queries = np.linspace(-0.2, 1.2, 30)
+    np.testing.assert_allclose(low.mean(queries), dense.mean(queries), atol=1e-6)
+
+
 @pytest.mark.parametrize("rank", [10, 20, 40])
 def test_reached_rank_is_reported(rank):
     """And the mean differs from the dense one."""

@@ -131,6 +131,42 @@ def test_via_points_of_either_sign_are_met():
     np.testing.assert_allclose(primitive.mean([[0.7]]), skill(velocity=False).mean([[0.7]]))
 
 
+def test_via_point_is_on_the_present_branch():
+    """Beyond half a turn from the auxiliary quaternion, the nearest zeta is used."""
+    times = np.linspace(0, 1, 25)[:, None]
+    zeta = times * [4.0, 1.0, 0.5]
+    inner = KMP.fit(
+        times, Gaussians.of(zeta, deviation=0.1), kernel=GaussianKernel(10.0), lambda_mean=1
+    )
+    winding = OrientationKMP(inner, [0, 0, 0, 1])
+    present = inner.mean([0.9])
+    assert np.linalg.norm(present) > np.pi
+    for sign in (1, -1):
+        adapted = winding.adapt([0.9], sign * winding.mean([0.9]), np.zeros((3, 3)))
+        np.testing.assert_allclose(adapted.primitive.mean([0.9]), present, atol=1e-8)
+
+
+@pytest.mark.parametrize("exact", [1, 2])
+def test_a_rotation_is_exact_about_all_axes(exact):
+    primitive = skill(velocity=False)
+    covariance = np.diag([0.0] * exact + [1e-2] * (3 - exact))
+    with pytest.raises(ValueError, match=rf"covariance\[0\] is 0 for {exact} of the 3 axes"):
+        primitive.adapt([0.5], primitive.mean([0.5]), covariance)
+
+
+def test_least_variance_is_that_of_each_output():
+    """Large positions do not limit how certain a rotation may be."""
+    times = np.linspace(0, 1, 20)[:, None]
+    sizes = np.array([1e3] * 3 + [0.3] * 3)
+    reference = Gaussians.of(sizes * np.sin(3 * times + np.arange(6)), deviation=1e-3 * sizes)
+    inner = KMP.fit(
+        times, reference, kernel=GaussianKernel(5.0), lambda_mean=1, prior_covariance=sizes**2
+    )
+    pose = PoseKMP(inner, [0, 0, 0, 1])
+    adapted = pose.adapt([0.5], pose.mean([0.5]), np.diag([1.0] * 3 + [1e-7] * 3))
+    assert (np.diagonal(adapted.predict([0.5])[1][0])[3:] < 1e-5).all()
+
+
 def test_via_point_may_fix_angular_velocity():
     primitive = skill(velocity=True)
     omega = np.array([[0.5, -0.3, 0.8]])

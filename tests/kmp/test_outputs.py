@@ -141,6 +141,32 @@ def test_constraint_on_outputs(kind, prior, tmp_path):
     back = loaded.without_via_points(QUERIES[9:10])
     assert_close(back.mean(QUERIES), more.mean(QUERIES), 1e-9)
 
+    refitted = adapted.refitted(adapted.base.reference)
+    assert_close(refitted.mean(QUERIES), adapted.mean(QUERIES), 1e-9)
+    extended = adapted.extended([[2.5]], Gaussians.of([0.0, 0.0, 0.0], deviation=0.1))
+    assert extended.mean(VIA)[1, 1] == pytest.approx(1.5, abs=1e-8)
+
+
+@pytest.mark.parametrize("representation", ["dense", "low_rank"])
+@pytest.mark.parametrize("prior", ["none", "covariance"])
+@pytest.mark.parametrize("exact", [0, 1, 2])
+def test_exact_and_free_outputs_of_one_point(exact, prior, representation):
+    """A map of outputs hides neither: the exact one is met, and the free ones follow it alone."""
+    primitive = fitted("one shape", prior, representation=representation)
+    point = VIA[:1]
+    desired = primitive.mean(point) + 0.3
+    deviation = np.full(3, np.inf)
+    deviation[exact] = 0.0
+    joint = primitive.predict_joint(np.vstack([point, QUERIES]))
+    gain = joint.covariance[0][:, exact] / joint.covariance[0][exact, exact]
+    expected = (joint.mean[0] + 0.3 * gain).reshape(-1, 3)
+    for means in (desired, desired + 7 * (deviation > 0)):
+        adapted = primitive.adapt(point, Gaussians.of(means, deviation=deviation), tolerance=0.0)
+        assert adapted.mean(point)[0, exact] == pytest.approx(desired[0, exact], abs=1e-6)
+        assert_close(adapted.mean(QUERIES), expected[1:], 1e-4)
+        variance = adapted.predict(point).covariance[0, exact, exact]
+        assert 0 < variance < 1e-6 * np.trace(joint.covariance[0])
+
 
 def test_unit_of_one_output_does_not_change_another():
     """With the outputs' variances as prior covariance."""

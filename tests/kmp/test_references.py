@@ -87,6 +87,21 @@ def test_via_points_are_met_in_other_frames():
     np.testing.assert_allclose(adapted.mean(t[-1:]), [[1.5, -0.6]], atol=0.03)
 
 
+@pytest.mark.parametrize("deviation", [[0, np.inf], [np.inf, 0.01], [0, 0.01]])
+@pytest.mark.parametrize("degrees", [90, 30])
+def test_exact_and_free_outputs_in_turned_frame(deviation, degrees):
+    cosine, sine = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    turn = np.array([[cosine, -sine], [sine, cosine]])
+    inner = learned()[0].primitives[0]
+    skill = LocalKMP((inner,), (CoordinateFrame(turn, [0.1, 0.2]),))
+    before = skill.mean([0.5])[0]
+    adapted = skill.adapt([0.5], Gaussians.of(before + 0.1, deviation=deviation), tolerance=0.0)
+    moved = adapted.mean([0.5])[0] - before
+    for move, spread in zip(moved, deviation, strict=True):
+        if spread == 0:
+            assert move == pytest.approx(0.1, abs=1e-6)
+
+
 def test_via_point_of_one_frame_moves_with_it():
     skill, t = learned()
     goal = skill.frames[1]
@@ -117,6 +132,19 @@ def test_motion_of_frames_is_the_derivative_of_their_mean():
     np.testing.assert_allclose(motion.velocity, (after - before) / (2 * h), rtol=1e-4)
     np.testing.assert_allclose(motion.acceleration, (after - 2 * now + before) / h**2, rtol=1e-3)
     np.testing.assert_allclose(1.5 * skill.jacobian(0.43)[:, 0], motion.velocity, rtol=1e-7)
+
+
+@pytest.mark.parametrize("ells", [(0.1, 2000.0), (2000.0, 0.1)])
+def test_motion_of_frames_with_unequal_kernels(ells):
+    """The step of differences suits the shortest length."""
+    t = np.linspace(0, 1, 60)[:, None]
+    reference = Gaussians.of(np.hstack([np.sin(9 * t), np.cos(5 * t)]), deviation=0.1)
+    parts = [KMP.fit(t, reference, kernel=GaussianKernel(ell), lambda_mean=1.0) for ell in ells]
+    skill = LocalKMP(tuple(parts), (CoordinateFrame.at([0, 0]), CoordinateFrame.at([0.1, 0])))
+    steps = 2e-4 * np.array([-4, -3, -2, -1, 1, 2, 3, 4])
+    weights = np.array([3, -32, 168, -672, 672, -168, 32, -3]) / 0.168
+    expected = weights @ skill.mean(0.4 + steps)
+    np.testing.assert_allclose(skill.jacobian(0.4)[:, 0], expected, rtol=1e-6)
 
 
 def test_uncertainty_and_samples_of_frames_are_of_their_product(tmp_path):

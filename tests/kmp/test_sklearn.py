@@ -36,6 +36,16 @@ def test_learns_any_unit_with_deviation():
     assert regressor.primitive_.jacobian(X[0]).shape == (2, 2)
 
 
+@pytest.mark.parametrize("components", [None, 2])
+@pytest.mark.parametrize("unit", [(1.0, 0.0), (1e9, 1e-3)])
+def test_learns_constant_output_and_any_unit(components, unit):
+    outputs = unit * np.sin(X[:, :1]) + [0.0, 0.1]
+    regressor = KMPRegressor(ell=0.3, components=components).fit(X, outputs)
+    mean, deviation = regressor.predict(X, return_std=True)
+    assert np.isfinite(deviation).all()
+    assert (np.abs(mean - outputs) <= 0.6 * np.maximum(unit, 1e-9)).all()
+
+
 def test_works_in_pipelines_and_searches():
     pipeline = make_pipeline(StandardScaler(), KMPRegressor(ell=1.0))
     assert cross_val_score(pipeline, X, Y[:, 0], cv=3).min() > 0.9

@@ -46,11 +46,10 @@ def primitive(request):
 
 def test_solution_is_stored_with_base(primitive):
     """Adapted solutions are stored with the arrays of their base."""
-    assert set(primitive.inner.solution.to_arrays()) == set(
-        primitive.base.inner.solution.to_arrays()
-    )
+    stored = named_arrays.to_arrays(primitive)
+    assert primitive.base.inner.solution.to_arrays().keys() <= stored.keys()
     assert primitive.representation == primitive.base.representation
-    restored = named_arrays.from_arrays(named_arrays.to_arrays(primitive))
+    restored = named_arrays.from_arrays(stored)
     assert type(restored.inner.solution) is type(primitive.inner.solution)
     assert np.array_equal(restored.mean(S), primitive.mean(S))
 

@@ -122,7 +122,7 @@ def test_a_task_between_via_points_has_none() -> None:
         kernel=primitive.kernel,
         lambda_mean=1.0,
         representation="dense",
-        prior_mean=AffineMean(np.zeros((outputs, width)), np.zeros(outputs)),
+        prior_mean=AffineMean(np.ones((outputs, width)), np.zeros(outputs)),
     )
     model = replace(shipped.model, primitive=sloped)  # type: ignore[type-var]
     file = with_file(replace(shipped, model=model)).file
