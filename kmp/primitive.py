@@ -35,7 +35,7 @@ from kmp.dense import Dense
 from kmp.functionals import Functionals
 from kmp.gaussians import Gaussians, check_gaussians, check_pairs, unchecked
 from kmp.kernel import Kernel
-from kmp.low_rank import RANK, TOLERANCE
+from kmp.low_rank import RANK, TOLERANCE, LowRank
 from kmp.outputs import as_one, constrained, constraints_of, is_one
 from kmp.plot import Plotted, Points, Shown
 from kmp.predictor import Inner, Predictor
@@ -43,7 +43,7 @@ from kmp.problem.database import Changes, Database, warn_of_missed
 from kmp.problem.hyperparameters import AffineMean, Hyperparameters
 from kmp.radial import GaussianKernel
 from kmp.representation import LARGE, solved
-from kmp.solution import BaseSolution, Solution, mean_of, resolved
+from kmp.solution import BaseSolution, Solution, check_resolved, mean_of, resolved
 from kmp.time_kernels import VelocityKernel
 
 _SAME_GOAL = 1e-12  # differences of goals below this share of the largest are rounding
@@ -573,20 +573,40 @@ class Alternatives(Sequence[KMP]):
         )
 
     def mean(self, queries: ArrayLike) -> Array:
-        """The means (G, M, O) of all G primitives at queries (M, I), equal to theirs to rounding.
+        """The means (G, M, O) of all G primitives at queries (M, I), equal to theirs to 1e-8.
 
-        Of goals that differ in their means only, at the same inputs, it takes hardly more time than
-        of one. Raises ValueError as `KMP.mean` does.
+        Of many goals with the same number of via-points it takes hardly more time than of one.
+        Raises ValueError as `KMP.mean` does.
         """
-        first = self._desired[0]
-        differ_in_means = all(
-            np.array_equal(inputs, self._inputs[0])
-            and np.array_equal(desired.covariance, first.covariance)
-            for inputs, desired in zip(self._inputs, self._desired, strict=True)
-        )
-        if differ_in_means and self._primitive._constraints is None:  # noqa: SLF001 (of its own kind)
-            return self._by_directions(queries)
+        solution = self._primitive.inner.solution
+        if constraints_of(solution) is None and len({len(via) for via in self._inputs}) == 1:
+            inputs = np.stack(self._inputs)
+            covariance = np.stack([desired.covariance for desired in self._desired])
+            if (inputs == inputs[0]).all() and (covariance == covariance[0]).all():
+                return self._by_directions(queries)
+            if isinstance(solution, (Dense, LowRank)) and not len(self._primitive.via_inputs):
+                return self._by_one_solve(solution, queries)
         return np.stack([adapted.mean(queries) for adapted in self])
+
+    def _by_one_solve(self, solution: Dense | LowRank, queries: ArrayLike) -> Array:
+        """The means (G, M, O) of goals at inputs of their own."""
+        from kmp.goals import moved_means  # rarely used
+
+        functionals = Functionals(self._primitive._checked_many(queries))  # noqa: SLF001 (of its own kind)
+        points = Functionals(np.concatenate(self._inputs))
+        normals = Gaussians.concatenated(self._desired)
+        added = Database(points, resolved(solution.hyperparameters, points, normals))
+        check_resolved(solution.hyperparameters, added)
+        period = self._primitive.kernel.period
+        replaced = [
+            solution.database.nearest(Functionals(via), self._tolerance, period)
+            for via in self._inputs
+        ]
+        means = moved_means(solution, added, replaced, functionals)
+        means += mean_of(solution, functionals)
+        for n in np.flatnonzero(np.isnan(means).any(axis=(1, 2))):
+            means[n] = self[int(n)].mean(queries)
+        return means
 
     def _by_directions(self, queries: ArrayLike) -> Array:
         """The means (G, M, O), which are affine in the goals: by one adaptation for each of the
@@ -600,12 +620,11 @@ class Alternatives(Sequence[KMP]):
         shares, sizes, directions = np.linalg.svd(
             (away / units).reshape(len(self), -1), full_matrices=False
         )
+        kept = sizes > _SAME_GOAL * sizes.max(initial=0.0)
         mean = self[0].mean(queries)
-        means = np.tile(mean, (len(self), 1, 1))
-        for share, size, direction in zip(shares.T, sizes, directions, strict=True):
-            if size > _SAME_GOAL * sizes[0]:
-                step = size * direction.reshape(first.mean.shape) * units
-                goal = unchecked(first.mean + step, first.covariance)
-                moved = primitive._toward(points, goal, self._tolerance)  # noqa: SLF001
-                means += share[:, None, None] * (moved.mean(queries) - mean)
-        return means
+        moves = np.empty((kept.sum(), mean.size))
+        for n, step in enumerate(sizes[kept, None] * directions[kept]):
+            goal = unchecked(first.mean + step.reshape(first.mean.shape) * units, first.covariance)
+            moved = primitive._toward(points, goal, self._tolerance)  # noqa: SLF001
+            moves[n] = (moved.mean(queries) - mean).ravel()
+        return np.asarray(mean + (shares[:, kept] @ moves).reshape(len(self), *mean.shape))

@@ -88,11 +88,14 @@ def test_goal_jacobian_is_that_of_any_goal():
 
 
 @pytest.mark.parametrize("representation", ["dense", "low_rank"])
-def test_exact_goals_near_each_other(representation):
+@pytest.mark.parametrize("apart", [0.0, 0.3])
+def test_exact_goals_near_each_other(representation, apart):
     of = primitive(representation)
-    via = [[0.5], [0.501]]
     alternatives = of.adapt_many(
-        [(via, Gaussians.of(np.full((2, 2), float(n)), deviation=0)) for n in range(3)]
+        [
+            ([[0.5 + n * apart], [0.501]], Gaussians.of(np.full((2, 2), float(n)), deviation=0))
+            for n in range(3)
+        ]
     )
     expected = [each.mean(QUERIES) for each in alternatives]
     np.testing.assert_allclose(alternatives.mean(QUERIES), expected, atol=1e-7)
@@ -103,9 +106,10 @@ def test_goals_without_via_points_or_lost_in_rounding():
     nothing = np.empty((0, 1)), Gaussians.of(np.empty((0, 2)), deviation=0.1)
     means = adapted.adapt_many([nothing, nothing]).mean(QUERIES)
     np.testing.assert_allclose(means, [adapted.mean(QUERIES)] * 2, atol=1e-12)
-    lost = adapted.adapt_many(goals(adapted, OTHER, deviation=1e-9))
-    with pytest.raises(ValueError, match="would be lost in rounding"):
-        lost.mean(QUERIES)
+    for of in (adapted, adapted.base):
+        lost = of.adapt_many(goals(of, OTHER, deviation=1e-9))
+        with pytest.raises(ValueError, match="would be lost in rounding"):
+            lost.mean(QUERIES)
 
 
 @pytest.mark.parametrize("size", [1e-9, 1e9])
