@@ -160,7 +160,7 @@ def test_waits_for_a_tool_that_cannot_come() -> None:
     target = Target(*at_rest(MIDDLE + np.array([0.38, 0.0, 0.0])), clamped=False)
     gaps_m = TUNING.setpoint.gap_waiting_m, TUNING.setpoint.gap_stopped_m
     for _ in range(5000):
-        slow = slow_down(state["setpoint"], MIDDLE, 1.0, generator.limits(state))
+        slow = slow_down(state["setpoint"], MIDDLE, 1.0, generator.limits(state)[0])
         generator.step(state, waiting(target, state["setpoint"], MIDDLE, gaps_m), BOX, FREE, slow)
     assert not state["setpoint"][1].round(4).any()
     assert 0.15 < state["setpoint"][0, 0] - MIDDLE[0] <= 0.201

@@ -19,6 +19,12 @@ ROUND_TO = 1e9
 _TINY = 1e-12  # a smaller sine is rounding
 
 
+@compiled
+def rounded(value: float, parts: float = ROUND_TO) -> float:
+    """A number, rounded to `parts` parts of a unit."""
+    return float(np.rint(value * parts) / parts)
+
+
 def rotation(quaternion: tuple[float, float, float, float]) -> Vector:
     """Rotation matrix (3, 3) of a quaternion x y z w, which is normalised first."""
     x, y, z, w = (v / math.hypot(*quaternion) for v in quaternion)
@@ -90,7 +96,7 @@ def normalise(quaternion: Vector) -> None:
         length += quaternion[i] * quaternion[i]
     length = math.copysign(math.sqrt(length), quaternion[3])
     for i in range(4):
-        quaternion[i] = np.rint(quaternion[i] / length * ROUND_TO) / ROUND_TO
+        quaternion[i] = rounded(quaternion[i] / length)
 
 
 @compiled
@@ -424,4 +430,4 @@ def round_to(values: Vector, parts: float) -> None:
     """
     for i in range(3):
         for j in range(3):
-            values[i, j] = np.rint(values[i, j] * parts) / parts
+            values[i, j] = rounded(values[i, j], parts)

@@ -9,7 +9,7 @@ import numpy as np
 from kmp.compiled import compiled
 from kmp.elementary import sin_cos
 from thirdhand.core.arm.least_squares import factorise, substitute
-from thirdhand.core.frame import Records, Vector
+from thirdhand.core.frame import Records, Struct, Vector
 
 
 class Kinematics:
@@ -86,7 +86,7 @@ def tool_speeds(
 
 
 @compiled
-def tool_speed_after(heres: Records, way: Vector, dq: Vector) -> float:  # noqa: PLR0915 - one algorithm
+def tool_speed_after(kinematics: Struct, way: Vector, dq: Vector) -> float:  # noqa: PLR0915 - one algorithm
     """Speed of the tool [m/s] at joint velocities dq (J,), after displacements `way` (J,) [rad, m].
 
     It is exact, by the product of exponentials. A revolute joint i is a screw with axis w and
@@ -98,7 +98,6 @@ def tool_speed_after(heres: Records, way: Vector, dq: Vector) -> float:  # noqa:
 
     The speed is |sum over i of dq_i (u'_i + w'_i × tool')|.
     """
-    kinematics = heres[0]
     joints = len(dq)
     jacobian = kinematics.jacobian
     tool = kinematics.position

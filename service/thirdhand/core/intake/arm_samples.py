@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from kmp.compiled import compiled
-from thirdhand.core.frame import Records, Vector
+from thirdhand.core.frame import Struct, Vector
 from thirdhand.core.tuning import TUNING, Tuning
 from thirdhand.settings.config import JointSettings, Settings
 
@@ -33,7 +33,7 @@ def still_ticks(settings: Settings, tuning: Tuning = TUNING) -> int:
 
 @compiled
 def compared(
-    states: Records, parameters: Records, position: Vector, velocity: Vector
+    state: Struct, config: Struct, position: Vector, velocity: Vector
 ) -> tuple[bool, float, float]:
     """Plausibility of joint positions and velocities (J,) [rad, rad/s], and their differences from
     earlier samples.
@@ -42,8 +42,6 @@ def compared(
     the largest difference from the newest sample [rad]; and from `arm_still_posture` [rad].
     Differences are divided by `per_rad`.
     """
-    state = states[0]
-    config = parameters[0]
     plausible = True
     deviation = 0.0
     moved = 0.0
@@ -59,10 +57,10 @@ def compared(
 
 
 @compiled
-def unwrap(states: Records, parameters: Records, position: Vector) -> None:
+def unwrap(state: Struct, config: Struct, position: Vector) -> None:
     """Shift continuous joints (J,) [rad] by whole turns to be nearest to the newest sample, in
     place. A driver that wraps at ±π and one that counts turns then give the same positions.
     """
     for i in range(len(position)):
-        if parameters[0].is_continuous[i] and math.isfinite(position[i]):
-            position[i] += TURN * np.rint((states[0].measured[i] - position[i]) / TURN)
+        if config.is_continuous[i] and math.isfinite(position[i]):
+            position[i] += TURN * np.rint((state.measured[i] - position[i]) / TURN)

@@ -16,21 +16,19 @@ rules are the same for both hands and for the arm:
 from __future__ import annotations
 
 from kmp.compiled import compiled
-from thirdhand.core.frame import Records, Vector
+from thirdhand.core.frame import Struct, Vector
 from thirdhand.core.intake import CONFIRMED_SAMPLES
 from thirdhand.core.vectors import distance
 
 
 @compiled
-def is_confirmed(states: Records, parameters: Records, side: int, position: Vector) -> bool:
+def is_confirmed(state: Struct, config: Struct, side: int, position: Vector) -> bool:
     """True if the jump of a hand to a position (3,) [m] is accepted; counts successive samples that
     agree.
 
     Accepted are at least CONFIRMED_SAMPLES samples that agree over confirmed_s.
     """
-    state = states[0]
-    config = parameters[0]
-    if state.jump_count[side] == 0 or not _goes_on(states, parameters, side, position):
+    if state.jump_count[side] == 0 or not _goes_on(state, config, side, position):
         state.jump_first_tick[side] = state.tick
         state.jump_count[side] = 0
     state.jumped_to[side, :] = position
@@ -41,12 +39,10 @@ def is_confirmed(states: Records, parameters: Records, side: int, position: Vect
 
 
 @compiled
-def _goes_on(states: Records, parameters: Records, side: int, position: Vector) -> bool:
+def _goes_on(state: Struct, config: Struct, side: int, position: Vector) -> bool:
     """True if a sample (3,) [m] agrees with the newest sample that jumped: it is less than
     `stale_ticks` later and within jump + jump_speed * elapsed time.
     """
-    state = states[0]
-    config = parameters[0]
     passed = state.tick - state.jump_newest_tick[side]
     near = (
         distance(position, state.jumped_to[side])

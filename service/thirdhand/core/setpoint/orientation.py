@@ -74,7 +74,7 @@ def turn_orientation(
     of +z is followed, e is its shortest turn and target_turning loses its component about +z.
     """
     config = parameters[0]
-    dt = parameters[0].period_s
+    dt = config.period_s
     error = np.empty(3)
     desired = np.empty(3)
     axis = np.empty(3)
