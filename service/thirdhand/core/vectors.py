@@ -66,6 +66,14 @@ def transform(
 
 
 @compiled
+def cross(a: Vector, b: Vector, out: Vector) -> None:
+    """Write into out (3,) the cross product a × b."""
+    out[0] = a[1] * b[2] - a[2] * b[1]
+    out[1] = a[2] * b[0] - a[0] * b[2]
+    out[2] = a[0] * b[1] - a[1] * b[0]
+
+
+@compiled
 def squared_distance(a: Vector, b: Vector) -> float:
     """|a - b|²."""
     total = 0.0

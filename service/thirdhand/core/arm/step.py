@@ -16,7 +16,7 @@ from kmp.compiled import compiled
 from kmp.elementary import sin_cos
 from thirdhand.core.arm.least_squares import solve
 from thirdhand.core.frame import Records, Struct, Vector
-from thirdhand.core.geometry import ROUND_TO, quaternion_of, swing, turn_between
+from thirdhand.core.geometry import quaternion_of, rounded, swing, turn_between
 from thirdhand.core.numerics import MAX_ERROR_M, MAX_JOINT_RAD, ROUNDING
 from thirdhand.core.vectors import dot, norm, square
 
@@ -222,8 +222,8 @@ def joint_step(
 
     for j in range(joints):
         speed = 0.0 if math.isnan(excess) else velocity[j] * arm.scale[j] / max(excess, 1.0)
-        velocity[j] = np.rint(speed * ROUND_TO) / ROUND_TO
-        out[1, j] = np.rint(out[1, j] * arm.scale[j] * ROUND_TO) / ROUND_TO
+        velocity[j] = rounded(speed)
+        out[1, j] = rounded(out[1, j] * arm.scale[j])
     return flags | SPEED if excess > 1.0 + ROUNDING else flags
 
 

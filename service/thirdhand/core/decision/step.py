@@ -17,6 +17,7 @@ from thirdhand.core.codes import (
     CLUTCH,
     CLUTCH_RELEASED,
     CONTESTED,
+    EITHER_UNSEEN,
     FAR,
     FAULT,
     FOLLOW,
@@ -44,7 +45,6 @@ from thirdhand.core.codes import (
     TOOL_SPEED,
     TWO_SOURCES,
     UNREACHABLE_WISH,
-    UNSEEN,
     UNSEEN_HAND_NEEDED,
     WISH_JUMPED,
     WISH_LEADS,
@@ -53,7 +53,7 @@ from thirdhand.core.codes import (
     WISH_UNKNOWN,
 )
 from thirdhand.core.frame import Records, Struct, Vector
-from thirdhand.core.vectors import distance
+from thirdhand.core.vectors import distance, norm, times
 
 
 @compiled
@@ -167,7 +167,7 @@ def _unseen_reason(state: Struct, conditions: int, gate_m: float) -> int:
         is_never_seen = min(state.hand_ticks[0], state.hand_ticks[1]) < 0
         return NO_HANDS if is_never_seen and not conditions & ONE_HAND else STALE_HAND
     is_needed = conditions & UNSEEN_HAND_NEEDED or state.mode != FOLLOW
-    return STALE_HAND if conditions & sum(UNSEEN) and is_needed else NONE
+    return STALE_HAND if conditions & EITHER_UNSEEN and is_needed else NONE
 
 
 @compiled
@@ -267,17 +267,14 @@ def _note_hold(state: Struct, conditions: int) -> None:
     The segment is the most probable one, if its probability is above 1/2.
     """
     if state.operator_hold and not state.held:
-        state.held = (
-            HELD_SEEN if conditions & HANDS_KNOWN and not conditions & sum(UNSEEN) else HELD_UNSEEN
-        )
+        is_seen = conditions & HANDS_KNOWN and not conditions & EITHER_UNSEEN
+        state.held = HELD_SEEN if is_seen else HELD_UNSEEN
         state.held_tick = state.tick
         state.held_segment = -1
-        for side in range(2):
-            for axis in range(3):
-                state.held_hands[side, axis] = state.hands[side, 0, axis]
-        for segment in range(len(state.segment_belief)):
-            if state.segment_belief[segment] > 0.5:
-                state.held_segment = segment
+        state.held_hands[:] = state.hands[:, 0]
+        most = state.segment_belief.argmax()
+        if state.segment_belief[most] > 0.5:
+            state.held_segment = most
     elif not state.operator_hold:
         state.held = 0
 
@@ -333,8 +330,7 @@ def _stuck(state: Struct, frame: Struct, kinematics: Struct, config: Struct) -> 
         state.stuck_tick = state.tick
         state.stuck_gap = gap
         state.stuck_target[:] = frame.target
-        for side in range(2):
-            state.stuck_hands[side] = state.hands[side, 0]
+        state.stuck_hands[:] = state.hands[:, 0]
         if gap < config.stuck_gap_m or moved > config.stuck_gap_m:
             state.way_tried = 0
         return 0
@@ -344,10 +340,10 @@ def _stuck(state: Struct, frame: Struct, kinematics: Struct, config: Struct) -> 
 @compiled
 def _is_outside(joints: Vector, config: Struct) -> bool:
     """True if a joint (J,) [rad] is outside its limits."""
-    outside = False
     for j in range(len(joints)):
-        outside = outside or joints[j] < config.lower[j] or joints[j] > config.upper[j]
-    return outside
+        if joints[j] < config.lower[j] or joints[j] > config.upper[j]:
+            return True
+    return False
 
 
 @compiled
@@ -359,15 +355,10 @@ def measured_error(state: Struct, kinematics: Struct, config: Struct) -> tuple[f
     q and J_p, the first three rows of `tasks`, are the commanded joints (J,) and the tool's
     Jacobian there.
     """
-    error = speed = 0.0
+    error = 0.0
     for joint in range(len(kinematics.joints)):
         error = max(
             error,
             abs(kinematics.joints[joint] - state.measured[joint]) / config.per_rad[joint],
         )
-    for axis in range(3):
-        along = 0.0
-        for joint in range(len(kinematics.joints)):
-            along += kinematics.tasks[axis, joint] * state.measured_velocities[joint]
-        speed += along * along
-    return error, math.sqrt(speed)
+    return error, norm(times(kinematics.tasks[:3], state.measured_velocities))

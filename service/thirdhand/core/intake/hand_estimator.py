@@ -254,18 +254,18 @@ def note_clock(state: Struct, config: Struct, side: int, stamp_ns: int, fresh: b
     longest_late_s = config.longest_late_s
     stamps = state.quickest_stamps_ns[side]
     ticks = state.quickest_ticks[side]
-    has_clock = state.clock_tick[side] >= 0
-    if not has_clock or (
-        not fresh and _later_s(state, side, 0, stamp_ns, period_s) > longest_late_s
-    ):
-        # learning (re)starts
-        stamps[:] = stamp_ns
-        ticks[:] = state.tick
-        state.clock_tick[side] = state.tick
+    longest = state.longest_delay_ticks[side]
+    later_s = _later_s(state, side, 0, stamp_ns, period_s)
+    restarts = state.clock_tick[side] < 0 or (not fresh and later_s > longest_late_s)
+    passed_s = (state.tick - state.clock_tick[side]) * period_s
+    is_over = not restarts and passed_s >= config.tracker_memory_s
+    if restarts:
+        stamps[1] = stamp_ns
+        ticks[1] = state.tick
+        longest[1] = 0
         state.clock[side] = LEARNING
-        state.longest_delay_ticks[side] = 0
-    elif (state.tick - state.clock_tick[side]) * period_s >= config.tracker_memory_s:
-        # the window is over: is its minimum delay that of the window before?
+    elif is_over:
+        # is the window's minimum delay that of the window before?
         change_s = _later_s(state, side, 1, stamps[0], period_s) - _later_s(
             state, side, 0, stamps[0], period_s
         )
@@ -273,19 +273,17 @@ def note_clock(state: Struct, config: Struct, side: int, stamp_ns: int, fresh: b
         state.clock[side] = TRUSTED if steady else DOUBTED
         stamps[1] = stamps[0]
         ticks[1] = ticks[0]
-        stamps[0] = stamp_ns
-        ticks[0] = state.tick
+        longest[1] = longest[0]
+    if restarts or is_over:
         state.clock_tick[side] = state.tick
-        state.longest_delay_ticks[side, 1] = state.longest_delay_ticks[side, 0]
-        state.longest_delay_ticks[side, 0] = 0
-    elif _later_s(state, side, 0, stamp_ns, period_s) < 0.0:
-        # a new minimum
+        longest[0] = 0
+    if restarts or is_over or later_s < 0.0:  # a new window, or a new minimum
         stamps[0] = stamp_ns
         ticks[0] = state.tick
 
     late = ticks_late(state, side, stamp_ns, period_s, longest_late_s)
-    state.longest_delay_ticks[side, 0] = max(state.longest_delay_ticks[side, 0], late)
-    stale = math.ceil(state.longest_delay_ticks[side].max() / config.end_share)
+    longest[0] = max(longest[0], late)
+    stale = math.ceil(longest.max() / config.end_share)
     state.stale_ticks[side] = min(max(stale, config.stale_ticks), config.stale_max_ticks)
 
 

@@ -1,4 +1,17 @@
-"""Compiled step of the intake: check samples, compare them with earlier ones, and filter them."""
+"""Compiled step of the intake: check samples, compare them with earlier ones, and filter them. The
+rules by which samples are accepted are the same for both hands and for the arm:
+
+* A stamp differs from the newest one. It is at most `longest_late_s` older (the arm's stamps must
+  increase), and ahead by at most the time since the newest sample arrived plus the time after which
+  the source is silent. Silence is judged by arrival; after a silence, any
+  stamp but the newest one is accepted.
+* A sample has jumped if the hand or arm cannot have moved there since its newest sample. A hand's
+  jump is accepted once CONFIRMED_SAMPLES successive samples, over at least confirmed_s, agree with
+  each other. A jump of the arm is accepted only after a silence, because an arm cannot jump.
+* The arm is contested when more than contested_on_share of its states within about
+  tracker_memory_s jumped, until the share is below contested_off_share: two drivers report it. Of
+  two trackers of one hand, the daemon takes the samples of one only.
+"""
 
 from __future__ import annotations
 
@@ -48,7 +61,6 @@ from thirdhand.core.intake.late_samples import (
     tick_made,
     wrong_samples,
 )
-from thirdhand.core.intake.plausibility import is_confirmed
 from thirdhand.core.intake.tremor import note_tremor
 from thirdhand.core.vectors import distance, square, squared_distance, transform
 
@@ -105,29 +117,6 @@ def note_arm(state: Struct, config: Struct, jumped: bool) -> None:
     share = state.arm_contested
     share += (1.0 - exp(-passed_s / config.tracker_memory_s)) * ((1.0 if jumped else 0.0) - share)
     state.arm_contested = rounded(share) if share > 1e-6 else 0.0
-
-
-@compiled
-def has_jumped(
-    state: Struct,
-    config: Struct,
-    side: int,
-    position: Vector,
-    expected: Vector,
-    interval_s: float,
-) -> bool:
-    """True if a sample x (3,) [m] of a fresh hand is farther from the `expected` position p (3,)
-    than a hand can move and a tracker's noise explains:
-
-        |x - p| > max(jump + jump_speed * interval, jump_noise_stds * noise standard deviation)
-
-    `interval_s` is the time since the sample from which p was predicted.
-    """
-    gate = max(
-        config.jump_m + config.jump_speed_mps * interval_s,
-        config.jump_noise_stds * math.sqrt(state.noise_variance[side]),
-    )
-    return bool(squared_distance(position, expected) > gate * gate)
 
 
 @compiled
@@ -252,22 +241,50 @@ def _jump(
 ) -> tuple[bool, int]:
     """True if a hand's sample has jumped, and the number of wrong samples before it.
 
-    The sample at `position` (3,) [m] was made in tick `made`, and has number `order` among the
-    retained ones. If it continues these without the newest few, those were wrong (`wrong_samples`),
+    A sample x (3,) [m] of a `fresh` hand, made in tick `made` and number `order` of the retained
+    ones, is a jump if it is farther from the expected position p (3,) than a hand can move and a
+    tracker's noise explains, in the interval since the sample from which p was predicted:
+
+        |x - p| > max(jump + jump_speed * interval, jump_noise_stds * noise standard deviation)
+
+    If it continues the retained samples without the newest few, those were wrong (`wrong_samples`),
     and it has not jumped.
     """
-    jumped = False
-    wrong = 0
-    if fresh:
-        # predicted from the sample before it, by stamp
-        prediction = expected(state, models, side, order, made)
-        neighbour = slot(state, side, min(order, state.kept[side] - 1))
-        interval_s = abs(made - state.kept_ticks[side, neighbour]) * config.period_s
-        jumped = has_jumped(state, config, side, position, prediction, interval_s)
-        if jumped and order == 0:
-            wrong = wrong_samples(state, config, models, side, made, position)
-            jumped = wrong == 0
-    return jumped, wrong
+    if not fresh:
+        return False, 0
+    # predicted from the sample before it, by stamp
+    prediction = expected(state, models, side, order, made)
+    neighbour = slot(state, side, min(order, state.kept[side] - 1))
+    interval_s = abs(made - state.kept_ticks[side, neighbour]) * config.period_s
+    gate_m = max(
+        config.jump_m + config.jump_speed_mps * interval_s,
+        config.jump_noise_stds * math.sqrt(state.noise_variance[side]),
+    )
+    if squared_distance(position, prediction) <= gate_m * gate_m:
+        return False, 0
+    wrong = wrong_samples(state, config, models, side, made, position) if order == 0 else 0
+    return wrong == 0, wrong
+
+
+@compiled
+def _is_confirmed(state: Struct, config: Struct, side: int, position: Vector) -> bool:
+    """True if the jump of a hand to a position (3,) [m] is accepted; counts successive samples that
+    agree. Accepted are at least CONFIRMED_SAMPLES samples that agree over confirmed_s.
+
+    A sample agrees with the newest one that jumped if it is less than `stale_ticks` later and
+    within jump + jump_speed * elapsed time.
+    """
+    passed = state.tick - state.jump_newest_tick[side]
+    near_m = config.jump_m + config.jump_speed_mps * passed * config.period_s
+    is_near = distance(position, state.jumped_to[side]) <= near_m
+    if state.jump_count[side] == 0 or passed >= config.stale_ticks or not is_near:
+        state.jump_first_tick[side] = state.tick
+        state.jump_count[side] = 0
+    state.jumped_to[side] = position
+    state.jump_newest_tick[side] = state.tick
+    state.jump_count[side] += 1
+    agree_s = (state.tick - state.jump_first_tick[side] + 0.5) * config.period_s
+    return bool(state.jump_count[side] >= CONFIRMED_SAMPLES and agree_s >= config.confirmed_s)
 
 
 @compiled
@@ -287,7 +304,7 @@ def _judge_hand(
     if cause >= 0:
         return cause, order, made, False, 0
     jumped, wrong = _jump(state, config, models, side, order, made, position, fresh)
-    if jumped and (order > 0 or not is_confirmed(state, config, side, position)):
+    if jumped and (order > 0 or not _is_confirmed(state, config, side, position)):
         cause = JUMPED
     return cause, order, made, jumped, wrong
 

@@ -9,7 +9,7 @@ import numpy as np
 from kmp.compiled import compiled
 from thirdhand.core.codes import FAULT
 from thirdhand.core.frame import Records, Struct, Vector
-from thirdhand.core.geometry import ROUND_TO, quaternion_of
+from thirdhand.core.geometry import quaternion_of, rounded
 from thirdhand.core.kinematics import tool_speed_after
 from thirdhand.core.numerics import INSIDE_LIMIT_SHARE, LARGEST_USABLE, ROUNDING, STOP_SAMPLES
 from thirdhand.core.stops import braking_together, fastest_stop
@@ -172,7 +172,7 @@ def make_safe(state: Vector, moved: Vector, parameters: Records) -> bool:
     stop = np.empty(6)
     dt = config.period_s
     for i in range(moved.shape[1]):
-        moved[0, i] = np.rint(moved[0, i] * ROUND_TO) / ROUND_TO
+        moved[0, i] = rounded(moved[0, i])
         fastest_stop(
             moved[1, i], moved[2, i], config.max_acceleration[i], config.max_jerk[i], dt, stop
         )
@@ -183,7 +183,7 @@ def make_safe(state: Vector, moved: Vector, parameters: Records) -> bool:
             fastest_stop(
                 state[1, i], state[2, i], config.max_acceleration[i], config.max_jerk[i], dt, stop
             )
-            moved[0, i] = np.rint((state[0, i] + stop[2]) * ROUND_TO) / ROUND_TO
+            moved[0, i] = rounded(state[0, i] + stop[2])
             moved[1, i] = stop[0]
             moved[2, i] = stop[1]
     return safe

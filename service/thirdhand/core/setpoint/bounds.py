@@ -51,40 +51,16 @@ def remember(hull: Vector, ticks: int, position: Vector, span_ticks: int) -> int
 
     Returns the number of targets in the newest span.
     """
-    if ticks >= span_ticks or ticks == 0:
-        if ticks > 0:
-            for span in range(HULL_SPANS - 1, 0, -1):
-                for axis in range(3):
-                    hull[span, 0, axis], hull[span, 1, axis] = (
-                        hull[span - 1, 0, axis],
-                        hull[span - 1, 1, axis],
-                    )
-        for axis in range(3):
-            hull[0, 0, axis] = hull[0, 1, axis] = position[axis]
-        return 1
-    for axis in range(3):
-        hull[0, 0, axis] = min(hull[0, 0, axis], position[axis])
-        hull[0, 1, axis] = max(hull[0, 1, axis], position[axis])
-    return ticks + 1
-
-
-@compiled
-def bounds_around(
-    hull: Vector,
-    ticks: int,
-    position: Vector,
-    config: Struct,
-    box: Vector,
-    low: Vector,
-    high: Vector,
-) -> int:
-    """Add a target (3,) with `remember`, then write the `bounds` into low and high (3,) [m].
-
-    Returns the number of targets in the newest span.
-    """
-    ticks = remember(hull, ticks, position, config.span_ticks)
-    bounds(hull, box, config, low, high)
-    return ticks
+    if 0 < ticks < span_ticks:
+        hull[0, 0] = np.minimum(hull[0, 0], position)
+        hull[0, 1] = np.maximum(hull[0, 1], position)
+        return ticks + 1
+    if ticks > 0:
+        for span in range(HULL_SPANS - 1, 0, -1):
+            hull[span] = hull[span - 1]
+    hull[0, 0] = position
+    hull[0, 1] = position
+    return 1
 
 
 @compiled

@@ -11,7 +11,14 @@ from thirdhand.core.codes import BROKEN, PLANNED, STOPPED
 from thirdhand.core.frame import Records, Struct, Vector
 from thirdhand.core.kinematics import joint_costs
 from thirdhand.core.numerics import LEAST_SPEED_MPS
-from thirdhand.core.setpoint.bounds import between, bounds_around, broken_bound, stopping, take_safe
+from thirdhand.core.setpoint.bounds import (
+    between,
+    bounds,
+    broken_bound,
+    remember,
+    stopping,
+    take_safe,
+)
 from thirdhand.core.setpoint.orientation import turn_orientation
 from thirdhand.core.vectors import distance, norm
 
@@ -71,7 +78,8 @@ def lead(
     target[0] = position
     target[1] = velocity
     target[2] = acceleration
-    state.hull_ticks = bounds_around(state.hull, state.hull_ticks, position, config, box, low, high)
+    state.hull_ticks = remember(state.hull, state.hull_ticks, position, config.span_ticks)
+    bounds(state.hull, box, config, low, high)
 
     jerk = np.empty(3)
     ahead = np.empty((3, 3))

@@ -19,7 +19,7 @@ from kmp.elementary import exp, tanh
 from kmp.loops.kernel_row import add_weighted
 from kmp.loops.mean import add_table
 from thirdhand.core.frame import Record, Records, Vector
-from thirdhand.core.geometry import ROUND_TO, round_to
+from thirdhand.core.geometry import ROUND_TO, round_to, rounded
 from thirdhand.core.numerics import MOTION_STEP_S, UNPRIMED_DECIDED
 from thirdhand.core.skill.memory import turning
 from thirdhand.core.skill.model import COVARIANCE_ROUND_TO, MOTION_ROUND_TO, Seen
@@ -268,7 +268,7 @@ def off_all(hands: Vector, segments: Records) -> float:
         for k in range(len(segments)):
             nearest = min(nearest, on_way(hands[3 * side : 3 * side + 3], segments[k], side)[1])
         farther = max(farther, nearest)
-    return float(np.rint(farther * MOTION_ROUND_TO) / MOTION_ROUND_TO)
+    return rounded(farther, MOTION_ROUND_TO)
 
 
 @compiled

@@ -21,7 +21,15 @@ from thirdhand.core.codes import (
 )
 from thirdhand.core.frame import Record, Records, Struct, Vector
 from thirdhand.core.geometry import normalise, turn_between, turn_on
-from thirdhand.core.vectors import dot, squared_distance
+from thirdhand.core.vectors import (
+    add_product,
+    dot,
+    norm,
+    square,
+    squared_distance,
+    times,
+    transform,
+)
 from thirdhand.core.wish import MOST_WISHES
 from thirdhand.core.wish.tuning import FADING_SHARE, RETAINED
 
@@ -55,12 +63,8 @@ def take(
     wish = wishes[0]
     rule = rules[0]
     pose = np.empty(7)
-    for i in range(3):
-        pose[i] = mapping[i, 3]
-        for k in range(3):
-            pose[i] += mapping[i, k] * position[k]
-    for k in range(4):
-        pose[3 + k] = orientation[k]
+    transform(mapping[:3, :3], mapping[:3, 3], position, pose)
+    pose[3:] = orientation
     cause = _fault(rule, pose, ahead_s, covariance)
     if cause >= 0:
         return cause
@@ -70,7 +74,7 @@ def take(
     if not _insert(wish, rule, tick, due, pose):
         return AHEAD
     _carry(covariance[:3, :3], mapping, 1.0, rule.unknown_std_m**2, wish.wish_covariances[:3])
-    unit = math.sqrt(dot(mapping[0, :3], mapping[0, :3]))
+    unit = norm(mapping[0, :3])
     _carry(
         covariance[3:, 3:], mapping, 1.0 / unit, rule.unknown_std_rad**2, wish.wish_covariances[3:]
     )
@@ -90,10 +94,10 @@ def _fault(rule: Struct, pose: Vector, ahead_s: float, covariance: Vector) -> in
             most = covariance[i, i] * covariance[j, j]
             if covariance[i, j] ** 2 > (1.0 + 1e-9) * most:
                 return NOT_FINITE
-    norm = math.sqrt(dot(pose[3:6], pose[3:6]) + pose[6] * pose[6])
-    if abs(norm - 1.0) > rule.norm_tolerance:
+    length = math.sqrt(square(pose[3:6]) + pose[6] * pose[6])
+    if abs(length - 1.0) > rule.norm_tolerance:
         return NOT_A_ROTATION
-    if dot(pose[:3], pose[:3]) > rule.farthest_m**2:
+    if square(pose[:3]) > rule.farthest_m**2:
         return OUT_OF_RANGE
     if ahead_s > rule.farthest_s:
         return AHEAD
@@ -273,10 +277,10 @@ def at(wish: Struct, rule: Struct, due: float, motion: Vector, quaternion: Vecto
         begin = h * _slope(wish, i, axis, rule.steady_ticks)
         end = h * _slope(wish, i + 1, axis, rule.steady_ticks)
         cubic = begin + end - 2.0 * way
-        square = 3.0 * way - 2.0 * begin - end
-        motion[0, axis] = start + s * (begin + s * (square + s * cubic))
-        motion[1, axis] = (begin + s * (2.0 * square + 3.0 * s * cubic)) / h_s
-        motion[2, axis] = (2.0 * square + 6.0 * s * cubic) / (h_s * h_s)
+        bend = 3.0 * way - 2.0 * begin - end
+        motion[0, axis] = start + s * (begin + s * (bend + s * cubic))
+        motion[1, axis] = (begin + s * (2.0 * bend + 3.0 * s * cubic)) / h_s
+        motion[2, axis] = (2.0 * bend + 6.0 * s * cubic) / (h_s * h_s)
     turn = np.empty(3)
     turn_between(wish.wish_poses[i, 3:], wish.wish_poses[i + 1, 3:], turn)
     for axis in range(3):
@@ -343,18 +347,15 @@ def _weigh(wish: Struct, frame: Struct, motion: Vector, quaternion: Vector) -> N
     """
     skill = frame.covariance
     weight = _gain(skill, wish.wish_covariances[:3])
-    less = np.empty((3, 3))
-    for i in range(3):
-        for j in range(3):
-            less[i, j] = dot(weight[i], skill[:, j])
+    less = np.zeros((3, 3))
+    add_product(weight, skill, less)
     off = motion[:, :3].copy()
     off[0] -= frame.target
     off[1] -= frame.target_velocity
     off[2] -= frame.target_acceleration
-    for i in range(3):
-        motion[0, i] = frame.target[i] + dot(weight[i], off[0])
-        motion[1, i] = frame.target_velocity[i] + dot(weight[i], off[1])
-        motion[2, i] = frame.target_acceleration[i] + dot(weight[i], off[2])
+    motion[0, :3] = frame.target + times(weight, off[0])
+    motion[1, :3] = frame.target_velocity + times(weight, off[1])
+    motion[2, :3] = frame.target_acceleration + times(weight, off[2])
     frame.covariance -= less
     _weigh_turn(wish, frame, motion, quaternion)
 
@@ -374,10 +375,8 @@ def _gain(skill: Vector, wish: Vector) -> Vector:
             d = (i + 2) % 3
             inverse[i, j] = total[a, c] * total[b, d] - total[a, d] * total[b, c]
     inverse /= dot(total[0], inverse[:, 0])
-    gain = np.empty((3, 3))
-    for i in range(3):
-        for j in range(3):
-            gain[i, j] = dot(skill[i], inverse[:, j])
+    gain = np.zeros((3, 3))
+    add_product(skill, inverse, gain)
     return gain
 
 
@@ -466,7 +465,7 @@ def _begin_offset(
     turn_on(before, step)
     turn_between(before, wish.wish_turn, offset[0, 3:])
     turn = offset[0, 3:]
-    away_m = math.sqrt(dot(offset[0, :3], offset[0, :3]) + rule.rad_as_m**2 * dot(turn, turn))
+    away_m = math.sqrt(square(offset[0, :3]) + rule.rad_as_m**2 * square(turn))
     wish.wish_rate = rule.fade_rate_per_s
     if away_m * FADING_SHARE * rule.fade_rate_per_s > rule.fade_mps:
         wish.wish_rate = rule.fade_mps / (FADING_SHARE * away_m)
