@@ -12,8 +12,7 @@ import numpy as np
 
 from kmp.compiled import compiled
 from thirdhand.core.frame import Struct, Vector
-from thirdhand.core.tuning import TUNING, Tuning
-from thirdhand.settings.config import JointSettings, Settings
+from thirdhand.settings.config import JointSettings
 
 TURN = 2.0 * math.pi
 
@@ -24,11 +23,6 @@ def in_turn(joints: JointSettings, position: Vector, near: Vector) -> Vector:
     """
     is_continuous = np.array(joints.every_kind) == "continuous"
     return position + np.where(is_continuous, TURN * np.rint((near - position) / TURN), 0.0)
-
-
-def still_ticks(settings: Settings, tuning: Tuning = TUNING) -> int:
-    """Number of ticks for which an arm must report one posture before it is accepted as at rest."""
-    return settings.ticks_in(tuning.intake.max_late_s)
 
 
 @compiled
@@ -42,15 +36,13 @@ def compared(
     the largest difference from the newest sample [rad]; and from `arm_still_posture` [rad].
     Differences are divided by `per_rad`.
     """
+    low, high = config.plausible_joints
     plausible = True
     deviation = 0.0
     moved = 0.0
     for i in range(len(position)):
-        plausible = (
-            plausible
-            and config.plausible_joints[0, i] <= position[i] <= config.plausible_joints[1, i]
-        )
-        plausible = plausible and abs(velocity[i]) <= config.max_joint_radps * config.per_rad[i]
+        is_slow = abs(velocity[i]) <= config.max_joint_radps * config.per_rad[i]
+        plausible = plausible and is_slow and low[i] <= position[i] <= high[i]
         deviation = max(deviation, abs(position[i] - state.measured[i]) / config.per_rad[i])
         moved = max(moved, abs(position[i] - state.arm_still_posture[i]) / config.per_rad[i])
     return plausible, deviation, moved

@@ -84,7 +84,8 @@ class HandEstimator:
 
     def begin(self, state: Record) -> None:
         """Set what holds before the first sample: noise variance, stillness and tremor."""
-        state["noise_variance"] = self._numbers.noise_std_m**2
+        noise_std_m = self._numbers.outlier_stds * self._numbers.least_noise_m
+        state["noise_variance"] = noise_std_m**2
         state["hand_stillness"] = STILL
         state["bank_ticks"] = -len(self._models)
         for side in (0, 1):

@@ -280,11 +280,11 @@ def _mix(  # noqa: C901, PLR0912 - one nest of loops
                 for axis in range(3):
                     mean[a, axis] += shares[i, j] / expected[j] * of_means[j, i, a, axis]
         for i in range(MODES):
-            off = of_means[j, i]
-            off -= mean
+            deviations = of_means[j, i]
+            deviations -= mean
             for a in range(STATES):
                 for b in range(a, STATES):
-                    variance = of_covariances[j, i, a, b] + dot(off[a], off[b]) / 3.0
+                    variance = of_covariances[j, i, a, b] + dot(deviations[a], deviations[b]) / 3.0
                     covariance[a, b] += shares[i, j] / expected[j] * variance
 
 

@@ -25,7 +25,6 @@ from thirdhand.contract.messages import (
 from thirdhand.contract.records import SIDES, SOURCES, Cause
 from thirdhand.core.frame import Event, Record, as_array, parameters
 from thirdhand.core.geometry import rotation
-from thirdhand.core.intake.arm_samples import still_ticks
 from thirdhand.core.intake.hand_estimator import HandEstimator
 from thirdhand.core.intake.motion_model import models
 from thirdhand.core.intake.step import report, take_arm, take_hand
@@ -108,7 +107,8 @@ class Intake:
             longest_late_s=longest_late_s,
             unseen_ticks=unseen_ticks,
             silent_ticks=_stale_ticks("joints/state", settings),
-            still_ticks=still_ticks(settings, tuning),
+            # for so long an arm must report one posture before it is accepted as at rest
+            still_ticks=settings.ticks_in(numbers.max_late_s),
             joint_jump_speed=float((np.array(joints.velocity) / per_rad).max()),
             plausible_joints=limits + numbers.max_outside_rad * per_rad * np.array([[-1.0], [1.0]]),
             per_rad=per_rad,
@@ -125,7 +125,8 @@ class Intake:
             jump_noise_stds=2.0 * numbers.outlier_stds,  # twice, as the prediction is uncertain too
             arm_still_rad=numbers.arm_still_rad,
             confirmed_s=numbers.confirmed_s,
-            delay_tolerance_s=numbers.delay_tolerance_s,
+            # 1 %, the largest drift between two clocks
+            delay_tolerance_s=0.01 * numbers.tracker_memory_s,
             contested_off_share=numbers.contested_off_share,
             max_joint_radps=numbers.max_joint_radps,
             is_continuous=np.array([int(kind == "continuous") for kind in joints.every_kind]),
@@ -146,9 +147,8 @@ class Intake:
 
     def begin(self, state: Record) -> None:
         """Set the values that hold before the first sample, in a state of zeros."""
-        for field in ("tick", "hand_ticks", "clock_tick", "memory_ticks"):
-            state[field] = -1
-        for field in ("arm_tick", "arm_still_tick", "arm_sample_ticks"):
+        of_hands = ("hand_ticks", "clock_tick", "memory_ticks")
+        for field in ("tick", *of_hands, "arm_tick", "arm_still_tick", "arm_sample_ticks"):
             state[field] = -1
         state["stale_ticks"] = self.parameters["stale_ticks"][0]
         self._estimator.begin(state)

@@ -66,16 +66,6 @@ from thirdhand.core.vectors import distance, square, squared_distance, transform
 
 
 @compiled
-def is_contested(state: Struct, config: Struct) -> bool:
-    """True if two sources report the arm: its share of contradicting states is above
-    contested_on_share, or above contested_off_share if it was contested at the last tick.
-    """
-    was_contested = state.reason == TWO_SOURCES
-    limit = config.contested_off_share if was_contested else config.contested_on_share
-    return bool(state.arm_contested > limit)
-
-
-@compiled
 def refusal(
     stamp_ns: int, newest_ns: int, fresh: bool, passed_s: float, silent_s: float, late_s: float
 ) -> int:
@@ -300,13 +290,13 @@ def _judge_hand(
     """Cause for which a hand's well-formed sample (3,) [m] is rejected, or -1; its order and tick,
     as of `_in_time`; and the result of `_jump`.
     """
-    cause, order, made = _in_time(state, config, side, stamp_ns, position, fresh)
+    cause, order, made_tick = _in_time(state, config, side, stamp_ns, position, fresh)
     if cause >= 0:
-        return cause, order, made, False, 0
-    jumped, wrong = _jump(state, config, models, side, order, made, position, fresh)
+        return cause, order, made_tick, False, 0
+    jumped, wrong = _jump(state, config, models, side, order, made_tick, position, fresh)
     if jumped and (order > 0 or not _is_confirmed(state, config, side, position)):
         cause = JUMPED
-    return cause, order, made, jumped, wrong
+    return cause, order, made_tick, jumped, wrong
 
 
 @compiled
@@ -405,9 +395,9 @@ def report(states: Records, frames: Records, parameters: Records) -> int:
     for side in range(2):
         sample_tick = state.hand_ticks[side]
         frame.hand_ages[side] = -1 if sample_tick < 0 else state.tick - sample_tick
-        frame.stale_ticks[side] = state.stale_ticks[side]
-        frame.hands[side] = state.hands[side, 0]
-        frame.hand_velocities[side] = state.hands[side, 1]
+    frame.stale_ticks[:] = state.stale_ticks
+    frame.hands[:] = state.hands[:, 0]
+    frame.hand_velocities[:] = state.hands[:, 1]
     frame.tick = state.tick
     frame.rejected[:] = state.rejected
     return _hand_conditions(frame, parameters[0]) | _arm_conditions(state, parameters[0])
@@ -430,7 +420,11 @@ def _hand_conditions(frame: Struct, config: Struct) -> int:
 
 @compiled
 def _arm_conditions(state: Struct, config: Struct) -> int:
-    """ARM_HEARD, ARM_STILL, ARM_GUIDED, CONTESTED and CLUTCH_RELEASED, as they hold now."""
+    """ARM_HEARD, ARM_STILL, ARM_GUIDED, CONTESTED and CLUTCH_RELEASED, as they hold now.
+
+    The arm is CONTESTED if its share of contradicting states is above contested_on_share, or above
+    contested_off_share if it was contested at the last tick.
+    """
     conditions = 0
     if state.arm_tick >= 0 and state.tick - state.arm_tick < config.silent_ticks:
         conditions |= ARM_HEARD
@@ -440,4 +434,6 @@ def _arm_conditions(state: Struct, config: Struct) -> int:
             conditions |= ARM_GUIDED
     if config.has_clutch and state.tick >= state.clutch_until_tick:
         conditions |= CLUTCH_RELEASED
-    return conditions | CONTESTED if is_contested(state, config) else conditions
+    was_contested = state.reason == TWO_SOURCES
+    limit = config.contested_off_share if was_contested else config.contested_on_share
+    return conditions | CONTESTED if state.arm_contested > limit else conditions

@@ -220,8 +220,8 @@ def _slope(wish: Struct, i: int, axis: int, steady_ticks: float) -> float:
         return 0.0
     if i + 1 < count:
         before = max(i - 1, 0)
-        way = poses[i + 1, axis] - poses[before, axis]
-        return float(way / (due[i + 1] - due[before]))
+        rise_m = poses[i + 1, axis] - poses[before, axis]
+        return float(rise_m / (due[i + 1] - due[before]))
 
     first = count - 2
     while first > max(count - RETAINED, 0) and due[i] - due[first - 1] <= steady_ticks:
@@ -273,11 +273,11 @@ def at(wish: Struct, rule: Struct, due: float, motion: Vector, quaternion: Vecto
     h_s = h * rule.period_s
     for axis in range(3):
         start = wish.wish_poses[i, axis]
-        way = wish.wish_poses[i + 1, axis] - start
+        rise = wish.wish_poses[i + 1, axis] - start
         begin = h * _slope(wish, i, axis, rule.steady_ticks)
         end = h * _slope(wish, i + 1, axis, rule.steady_ticks)
-        cubic = begin + end - 2.0 * way
-        bend = 3.0 * way - 2.0 * begin - end
+        cubic = begin + end - 2.0 * rise
+        bend = 3.0 * rise - 2.0 * begin - end
         motion[0, axis] = start + s * (begin + s * (bend + s * cubic))
         motion[1, axis] = (begin + s * (2.0 * bend + 3.0 * s * cubic)) / h_s
         motion[2, axis] = (2.0 * bend + 6.0 * s * cubic) / (h_s * h_s)
@@ -349,13 +349,13 @@ def _weigh(wish: Struct, frame: Struct, motion: Vector, quaternion: Vector) -> N
     weight = _gain(skill, wish.wish_covariances[:3])
     less = np.zeros((3, 3))
     add_product(weight, skill, less)
-    off = motion[:, :3].copy()
-    off[0] -= frame.target
-    off[1] -= frame.target_velocity
-    off[2] -= frame.target_acceleration
-    motion[0, :3] = frame.target + times(weight, off[0])
-    motion[1, :3] = frame.target_velocity + times(weight, off[1])
-    motion[2, :3] = frame.target_acceleration + times(weight, off[2])
+    difference = motion[:, :3].copy()
+    difference[0] -= frame.target
+    difference[1] -= frame.target_velocity
+    difference[2] -= frame.target_acceleration
+    motion[0, :3] = frame.target + times(weight, difference[0])
+    motion[1, :3] = frame.target_velocity + times(weight, difference[1])
+    motion[2, :3] = frame.target_acceleration + times(weight, difference[2])
     frame.covariance -= less
     _weigh_turn(wish, frame, motion, quaternion)
 
