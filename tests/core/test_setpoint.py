@@ -12,7 +12,16 @@ from hypothesis import settings as example_settings
 from hypothesis import strategies as st
 
 from support.explained import Explained, margin
-from support.setpoints import BOX, FREE, MIDDLE, PERIOD_S, TOOL, at_rest, driven
+from support.setpoints import (
+    BOX,
+    FREE,
+    MIDDLE,
+    PERIOD_S,
+    TOOL,
+    at_rest,
+    driven,
+    name_of_broken_bound,
+)
 from support.wam import STATE
 from thirdhand.core.frame import Vector, blank
 from thirdhand.core.setpoint.stage import SetpointGenerator
@@ -211,9 +220,9 @@ def test_broken_bound_is_named() -> None:
     ):
         state["setpoint"] = before
         state["setpoint"][row, 0] = value
-        assert generator.name_of_broken_bound(state, before, BOX) == bound
+        assert name_of_broken_bound(generator, state, before) == bound
     state["setpoint"][0, 0] = np.nan
-    assert generator.name_of_broken_bound(state, before, BOX) == "not finite"
+    assert name_of_broken_bound(generator, state, before) == "not finite"
 
 
 # --- stops ------------------------------------------------------------

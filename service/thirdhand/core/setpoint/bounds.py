@@ -33,7 +33,7 @@ from thirdhand.core.codes import (
     POSITION_BOUND,
     SPEED_BOUND,
 )
-from thirdhand.core.frame import Records, Struct, Vector
+from thirdhand.core.frame import Struct, Vector
 from thirdhand.core.numerics import ROUNDING, STOP_SECANT_TOLERANCE_M, STOP_SECANTS, TOLERANCE
 from thirdhand.core.setpoint import HULL_SPANS
 from thirdhand.core.stops import fastest_stop
@@ -85,7 +85,7 @@ def bounds(hull: Vector, box: Vector, config: Struct, low: Vector, high: Vector)
 
 @compiled
 def broken_bound(
-    setpoint: Vector, before: Vector, hull: Vector, box: Vector, parameters: Records
+    setpoint: Vector, before: Vector, hull: Vector, box: Vector, config: Struct
 ) -> int:
     """The first SetpointBound that a step from `before` breaks; NO_BOUND if it breaks none.
 
@@ -99,7 +99,6 @@ def broken_bound(
         POSITION      the position is beyond `bounds`, and beyond the position before, by more than
                       `longest_stop`, which is more than any stop from outside takes
     """
-    config = parameters[0]
     max_speed = config.max_speed
     longest_stop = config.longest_stop
     if not np.isfinite(setpoint).all():

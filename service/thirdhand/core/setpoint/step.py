@@ -96,7 +96,7 @@ def lead(
 
     if not take_safe(setpoint, ahead, config, costs, slow, low, high):
         met = STOPPED
-    if broken_bound(setpoint, before, state.hull, box, parameters):
+    if broken_bound(setpoint, before, state.hull, box, config):
         setpoint[:] = before
         return BROKEN
     return met

@@ -154,14 +154,9 @@ def recall(states: Records, rules: Records, seen: Seen) -> bool:
     for n in range(2):
         side = rule.sides[n]
         seen.stillness[n] = state.hand_stillness[side]
-        for i in range(3):
-            for order in range(3):
-                now[order, 3 * n + i] = state.hands[side, order, i]
-            for row in range(len(seen.past)):
-                seen.past[row, 3 * n + i] = state.memory[row, side, i]
-        for i in range(9):
-            for row in range(len(seen.turns)):
-                seen.turns[row, 9 * n + i] = state.turns[row, side, i]
+        now[:, 3 * n : 3 * n + 3] = state.hands[side]
+        seen.past[:, 3 * n : 3 * n + 3] = state.memory[:, side]
+        seen.turns[:, 9 * n : 9 * n + 9] = state.turns[:, side]
     if rule.late_s == 0.0:
         seen.moving[:] = now
     else:

@@ -396,10 +396,7 @@ def _ambiguity(belief: Vector, tools: Vector) -> float:
 
     Segments below LEAST_SEGMENT_PROBABILITY are left out.
     """
-    most = 0
-    for k in range(len(tools)):
-        if belief[k] > belief[most]:
-            most = k
+    most = belief[: len(tools)].argmax()
     out = 0.0
     for k in range(len(tools)):
         if belief[k] < LEAST_SEGMENT_PROBABILITY or k == most:
@@ -549,12 +546,10 @@ def elsewhere(
         return 0.0
     recognise(unprimed, now, period_s, segments, 1.0)
     count = len(segments)
-    most = 0
+    most = belief[:count].argmax()
     difference = 0.0
     for k in range(count):
         difference = max(difference, abs(unprimed[k] - belief[k]))
-        if belief[k] > belief[most]:
-            most = k
     if difference < LEAST_SEGMENT_PROBABILITY:
         unprimed[0] = UNPRIMED_DECIDED
         return 0.0
