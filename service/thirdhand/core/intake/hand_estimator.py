@@ -3,8 +3,8 @@ samples.
 
 The estimator is an interacting-multiple-model filter (`mode_filter`) with the modes rest, steady,
 reach and change. The modes share one measurement noise variance r, which is estimated from the
-third differences of the samples: smooth motion leaves almost nothing in them, and white noise of
-variance r leaves the variance 20 r on each axis.
+third differences of the samples (`retained_samples`): smooth motion leaves almost nothing in them,
+and white noise of variance r leaves the variance 20 r on each axis.
 
 Stillness, 0 to 1, distinguishes a hand that waits at a via-point from one on its way. It rises
 slowly and falls at once. A tremor does not lower it, and a turning point on the way hardly raises

@@ -1,7 +1,7 @@
 """Intake of hand and arm samples: check them, map them to frame `base`, and filter them to a state
 at the tick. The clutch, the wish for the gripper and reports of hand guiding are taken in here too.
 
-`step` states all rules by which samples are accepted; `late_samples` handles late ones.
+`step` states all rules by which samples are accepted; `retained_samples` filters late ones too.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@ rules by which samples are accepted are the same for both hands and for the arm:
 
 * A stamp differs from the newest one. It is at most `longest_late_s` older (the arm's stamps must
   increase), and ahead by at most the time since the newest sample arrived plus the time after which
-  the source is silent. Silence is judged by arrival; after a silence, any
-  stamp but the newest one is accepted.
+  the source is silent. Silence is judged by arrival; after a silence, any stamp but the newest one
+  is accepted.
 * A sample has jumped if the hand or arm cannot have moved there since its newest sample. A hand's
   jump is accepted once CONFIRMED_SAMPLES successive samples, over at least confirmed_s, agree with
   each other. A jump of the arm is accepted only after a silence, because an arm cannot jump.
@@ -52,7 +52,7 @@ from thirdhand.core.intake.hand_estimator import (
     ticks_late,
     turn_to,
 )
-from thirdhand.core.intake.late_samples import (
+from thirdhand.core.intake.retained_samples import (
     drop,
     expected,
     order_of,

@@ -1,5 +1,5 @@
-"""Late and overtaken samples of a hand: the tick in which each was made, and their filtering at
-that tick.
+"""Retained samples of a hand, in the order of their stamps, and their filtering, each at the tick
+in which it was made.
 
 A tracker's clock is that of another machine, so its stamps only show how much longer the delay of
 one sample is than that of another. Samples with the minimum delay of the last one to two seconds
@@ -9,7 +9,8 @@ While it is not trusted, samples are taken to be made when they arrive. Samples 
 other are always put in the order of their stamps.
 
 The newest KEPT samples of each hand are retained in rings, each with the state of the filter after
-it. `order` counts them backward from the newest, which is 0.
+it, so that late and overtaken ones can be inserted. `order` counts them backward from the newest,
+which is 0.
 """
 
 from __future__ import annotations
@@ -164,7 +165,7 @@ def insert(
     restarts: bool,
 ) -> None:
     """Insert a sample (3,) [m] into a hand's ring as number `order`; `restarts` marks that the
-    filter starts anew with it. The filter's states in the ring are not moved: `filter_in` writes
+    filter starts anew with it. The filter's states in the ring are not moved: `_filter_in` writes
     them again.
     """
     state.kept_newest[side] = (state.kept_newest[side] + 1) % KEPT
