@@ -11,9 +11,9 @@ import pytest
 
 from support.tracked import LEFT, PERIOD_S, Hands, follow
 from thirdhand.core.frame import Vector
-from thirdhand.core.intake.hand_estimator import stillness_of
 from thirdhand.core.intake.motion_model import REST
 from thirdhand.core.tuning import TUNING
+from thirdhand.skills.recognition import stillness_of
 
 LEAST_NOISE_M = TUNING.intake.least_noise_m
 

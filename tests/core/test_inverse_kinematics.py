@@ -53,9 +53,9 @@ def test_speeds_and_errors_are_those_of_numpy() -> None:
     assert total == pytest.approx(columns @ (np.abs(dq) + ddq**2 / (2 * jerk)), rel=1e-12)
     measured = q + 0.01 * random.normal(size=7)
     error, fast = measured_error(
-        parameters(measured=measured, measured_velocities=dq),
-        state,
-        parameters(per_rad=np.ones(len(dq))),
+        parameters(measured=measured, measured_velocities=dq)[0],
+        state[0],
+        parameters(per_rad=np.ones(len(dq)))[0],
     )
     assert (error, fast) == pytest.approx((np.abs(q - measured).max(), speed), rel=1e-12)
 
@@ -69,14 +69,14 @@ def test_tool_speed_after_is_that_of_pinocchio(name: str) -> None:
     joints = len(settings.joints.names)
     for _ in range(20):
         q, step_rad, dq = random.uniform(-1, 1, (3, joints))
-        speed = tool_speed_after(arm.at(q).record, step_rad, dq)
+        speed = tool_speed_after(arm.at(q).record[0], step_rad, dq)
         assert speed == pytest.approx(np.linalg.norm(arm.at(q + step_rad).tasks[:3] @ dq), rel=1e-9)
 
 
 def test_setpoint_waits_for_a_late_tool() -> None:
     setpoint = np.zeros((3, 3))
     tool = np.zeros(3)
-    limits = parameters(max_speed=0.8, gap_free_m=GAP_FREE_M, gap_slow_m=GAP_SLOW_M)
+    limits = parameters(max_speed=0.8, gap_free_m=GAP_FREE_M, gap_slow_m=GAP_SLOW_M)[0]
     setpoint[0, 0] = GAP_FREE_M + GAP_SLOW_M
     setpoint[1, 0] = 0.2
     assert slow_down(setpoint, tool, 1.0, limits) == pytest.approx(0.5)

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from support.tracked import LEFT, PERIOD_S, RIGHT, Hands
 from thirdhand.contract.records import Cause
 from thirdhand.core.frame import Vector
-from thirdhand.core.intake.late_samples import lateness_ms
+from thirdhand.daemon.input_monitor import lateness_ms
 
 WARM_S = 2.5  # a clock is recognised as steady within this time
 ZERO_NS = 1_700_000_000_000_000_000

@@ -55,7 +55,7 @@ def both_remembered(
             state["hand_ticks"] = tick
             state["hands"][:, 0] = pair.reshape(2, 3)
             state["hand_turns"] = turn.reshape(2, 9)
-            remember(states, period_s, MEMORY_LAG_S, TURN_LAG_S)
+            remember(state, period_s, MEMORY_LAG_S, TURN_LAG_S)
         out.append(state["memory"].reshape(ORDER, 6).copy())
         turned.append(state["turns"].reshape(TURNS, 18).copy())
     return np.array(out), np.array(turned)

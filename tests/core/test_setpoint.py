@@ -12,7 +12,16 @@ from hypothesis import settings as example_settings
 from hypothesis import strategies as st
 
 from support.explained import Explained, margin
-from support.setpoints import BOX, FREE, MIDDLE, PERIOD_S, TOOL, at_rest, driven
+from support.setpoints import (
+    BOX,
+    FREE,
+    MIDDLE,
+    PERIOD_S,
+    TOOL,
+    at_rest,
+    driven,
+    name_of_broken_bound,
+)
 from support.wam import STATE
 from thirdhand.core.frame import Vector, blank
 from thirdhand.core.setpoint.stage import SetpointGenerator
@@ -160,7 +169,7 @@ def test_waits_for_a_tool_that_cannot_come() -> None:
     target = Target(*at_rest(MIDDLE + np.array([0.38, 0.0, 0.0])), clamped=False)
     gaps_m = TUNING.setpoint.gap_waiting_m, TUNING.setpoint.gap_stopped_m
     for _ in range(5000):
-        slow = slow_down(state["setpoint"], MIDDLE, 1.0, generator.limits(state))
+        slow = slow_down(state["setpoint"], MIDDLE, 1.0, generator.limits(state)[0])
         generator.step(state, waiting(target, state["setpoint"], MIDDLE, gaps_m), BOX, FREE, slow)
     assert not state["setpoint"][1].round(4).any()
     assert 0.15 < state["setpoint"][0, 0] - MIDDLE[0] <= 0.201
@@ -211,9 +220,9 @@ def test_broken_bound_is_named() -> None:
     ):
         state["setpoint"] = before
         state["setpoint"][row, 0] = value
-        assert generator.name_of_broken_bound(state, before, BOX) == bound
+        assert name_of_broken_bound(generator, state, before) == bound
     state["setpoint"][0, 0] = np.nan
-    assert generator.name_of_broken_bound(state, before, BOX) == "not finite"
+    assert name_of_broken_bound(generator, state, before) == "not finite"
 
 
 # --- stops ------------------------------------------------------------

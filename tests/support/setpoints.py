@@ -6,7 +6,10 @@ import numpy as np
 
 from support.explained import Explained
 from support.wam import STATE
-from thirdhand.core.frame import Vector, blank
+from thirdhand.core.codes import SetpointBound
+from thirdhand.core.frame import Record, Vector, blank
+from thirdhand.core.setpoint.bounds import broken_bound
+from thirdhand.core.setpoint.stage import SetpointGenerator
 from thirdhand.core.skill.model import Target
 from thirdhand.settings.config import Settings, ToolSettings
 
@@ -20,6 +23,13 @@ FREE = np.zeros((3, 3, 7))  # no joint limits
 def at_rest(position: Vector | tuple[float, ...]) -> Vector:
     """A motion (3, 3) at rest at a position."""
     return np.array([position, (0.0,) * 3, (0.0,) * 3])
+
+
+def name_of_broken_bound(generator: SetpointGenerator, state: Record, before: Vector) -> str:
+    """Name of the bound that a step from `before` (3, 3) broke; empty if there is none."""
+    limits = generator.limits(state)[0]
+    bound = SetpointBound(broken_bound(state["setpoint"], before, state["hull"], BOX, limits))
+    return bound.name.lower().replace("_", " ") if bound else ""
 
 
 def driven(
@@ -43,6 +53,6 @@ def driven(
         before = state["setpoint"].copy()
         generator.engage(state, target[0])
         results.append(generator.step(state, Target(*target, clamped=False), BOX, costs, 1.0))
-        assert generator.name_of_broken_bound(state, before, BOX) == ""
+        assert name_of_broken_bound(generator, state, before) == ""
         out.append(state["setpoint"].copy())
     return np.array(out), np.array(results)

@@ -10,7 +10,7 @@ from support.wam import FRAME, JOINT_NAMES, STATE
 from thirdhand.contract.messages import JointState, PoseStamped
 from thirdhand.contract.records import Cause
 from thirdhand.core.codes import ARM_HEARD
-from thirdhand.core.frame import Record, Vector, as_array, blank, copied
+from thirdhand.core.frame import Record, Vector, blank, copied
 from thirdhand.core.intake.hand_estimator import is_fresh
 from thirdhand.core.intake.stage import Intake
 from thirdhand.settings.config import HandSettings, Settings, TrackerSettings
@@ -64,7 +64,7 @@ class Hands:
 
     def fresh(self, side: int = LEFT) -> bool:
         stale_ticks = max(1, round(self.settings.hands.stale_ms / 1000 * self.settings.rate_hz))
-        return bool(is_fresh(as_array(self.state), side, stale_ticks))
+        return bool(is_fresh(self.state, side, stale_ticks))
 
     def heard(self) -> bool:
         """True if the arm has reported its joints recently enough."""

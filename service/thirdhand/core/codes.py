@@ -93,45 +93,42 @@ class ClockTrust(enum.IntEnum):
 
 # The same codes as plain integers: compiled functions need them, and in Python each access to a
 # member of an enumeration takes a microsecond.
-HANDS_KNOWN = int(Condition.HANDS_KNOWN)
-ARM_HEARD = int(Condition.ARM_HEARD)
-ARM_STILL = int(Condition.ARM_STILL)
-CONTESTED = int(Condition.CONTESTED)
-UNSEEN = (int(Condition.LEFT_UNSEEN), int(Condition.RIGHT_UNSEEN))
-EITHER_UNSEEN = sum(UNSEEN)
-ARM_INSIDE = int(Condition.ARM_INSIDE)
-ONE_HAND = int(Condition.ONE_HAND)
-SEGMENT_AMBIGUOUS = int(Condition.SEGMENT_AMBIGUOUS)
-UNSEEN_HAND_NEEDED = int(Condition.UNSEEN_HAND_NEEDED)
-CLUTCH_RELEASED = int(Condition.CLUTCH_RELEASED)
-ARM_GUIDED = int(Condition.ARM_GUIDED)
-WISH_LEADS = int(Condition.WISH_LEADS)
-WISH_UNKNOWN = int(Condition.WISH_UNKNOWN)
-WISH_SILENT = int(Condition.WISH_SILENT)
-WISH_JUMPED = int(Condition.WISH_JUMPED)
-WISH_OUTSIDE = int(Condition.WISH_OUTSIDE)
-BY_SKILL = int(LedBy.SKILL)
-BY_WISHES = int(LedBy.WISHES)
-STARTS_ASSUMED = int(Start.ASSUMED)
-STARTS_MEASURED = int(Start.MEASURED)
-READY = int(ArmReady.READY)
-RETURNING = int(ArmReady.RETURNING)
-HELD_UNSEEN = int(Held.HANDS_UNSEEN)
-HELD_SEEN = int(Held.HANDS_SEEN)
-NOTICED = int(Stuck.NOTICED)
-HELD = int(Stuck.HELD)
-PLANNED = int(SetpointStep.PLANNED)
-STOPPED = int(SetpointStep.STOPPED)
-BROKEN = int(SetpointStep.BROKEN)
-NO_BOUND = int(SetpointBound.NONE)
-FINITE_BOUND = int(SetpointBound.NOT_FINITE)
-SPEED_BOUND = int(SetpointBound.SPEED)
-ACCELERATION_BOUND = int(SetpointBound.ACCELERATION)
-JERK_BOUND = int(SetpointBound.JERK)
-POSITION_BOUND = int(SetpointBound.POSITION)
-LEARNING = int(ClockTrust.LEARNING)
-DOUBTED = int(ClockTrust.DOUBTED)
-TRUSTED = int(ClockTrust.TRUSTED)
+(
+    HANDS_KNOWN,
+    ARM_HEARD,
+    ARM_STILL,
+    CONTESTED,
+    LEFT_UNSEEN,
+    RIGHT_UNSEEN,
+    ARM_INSIDE,
+    ONE_HAND,
+    SEGMENT_AMBIGUOUS,
+    UNSEEN_HAND_NEEDED,
+    CLUTCH_RELEASED,
+    ARM_GUIDED,
+    WISH_LEADS,
+    WISH_UNKNOWN,
+    WISH_SILENT,
+    WISH_JUMPED,
+    WISH_OUTSIDE,
+) = map(int, Condition)
+UNSEEN = (LEFT_UNSEEN, RIGHT_UNSEEN)
+EITHER_UNSEEN = LEFT_UNSEEN | RIGHT_UNSEEN
+BY_SKILL, BY_WISHES = map(int, LedBy)
+STARTS_ASSUMED, STARTS_MEASURED = map(int, Start)
+READY, RETURNING = map(int, ArmReady)
+NOTICED, HELD = map(int, Stuck)
+HELD_UNSEEN, HELD_SEEN = map(int, Held)
+PLANNED, STOPPED, BROKEN = map(int, SetpointStep)
+(
+    NO_BOUND,
+    FINITE_BOUND,
+    SPEED_BOUND,
+    ACCELERATION_BOUND,
+    JERK_BOUND,
+    POSITION_BOUND,
+) = map(int, SetpointBound)
+LEARNING, DOUBTED, TRUSTED = map(int, ClockTrust)
 HOLD = int(Mode.HOLD)
 FOLLOW = int(Mode.FOLLOW)
 FAULT = int(Mode.FAULT)

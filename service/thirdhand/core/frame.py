@@ -25,6 +25,8 @@ from thirdhand.core import arm, decision, intake, limiter, separation, setpoint,
 Vector: TypeAlias = NDArray[np.float64]
 Record: TypeAlias = np.void
 Records: TypeAlias = NDArray[np.void]
+Struct: TypeAlias = Any
+"""One of `Records` in a compiled function, which reads its fields as attributes."""
 DType: TypeAlias = np.dtype[np.void]
 Outputs: TypeAlias = Sequence[tuple[str, bytes]]
 """Keys below the cell's, each with the bytes to publish."""

@@ -13,10 +13,17 @@ import numpy as np
 from kmp.compiled import compiled
 from kmp.elementary import atan2, sin_cos
 from thirdhand.core.frame import Records, Vector
+from thirdhand.core.vectors import add_product, cross, dot, norm, transform
 
 # parts of a unit; values are rounded so that machines that differ in the last bits agree
 ROUND_TO = 1e9
 _TINY = 1e-12  # a smaller sine is rounding
+
+
+@compiled
+def rounded(value: float, parts: float = ROUND_TO) -> float:
+    """A number, rounded to `parts` parts of a unit."""
+    return float(np.rint(value * parts) / parts)
 
 
 def rotation(quaternion: tuple[float, float, float, float]) -> Vector:
@@ -90,7 +97,7 @@ def normalise(quaternion: Vector) -> None:
         length += quaternion[i] * quaternion[i]
     length = math.copysign(math.sqrt(length), quaternion[3])
     for i in range(4):
-        quaternion[i] = np.rint(quaternion[i] / length * ROUND_TO) / ROUND_TO
+        quaternion[i] = rounded(quaternion[i] / length)
 
 
 @compiled
@@ -122,16 +129,14 @@ def swing(start: Vector, quaternion: Vector, out: Vector) -> None:
     """
     end = np.empty(3)
     axis_of(quaternion, end)
-    x = start[1] * end[2] - start[2] * end[1]
-    y = start[2] * end[0] - start[0] * end[2]
-    z = start[0] * end[1] - start[1] * end[0]
-    sine = math.sqrt(x * x + y * y + z * z)
-    out[:] = 0.0
+    cross(start, end, out)
+    sine = norm(out)
     if sine > 1e-9:
-        size = atan2(sine, start[0] * end[0] + start[1] * end[1] + start[2] * end[2]) / sine
-        out[0] = size * x
-        out[1] = size * y
-        out[2] = size * z
+        size = atan2(sine, dot(start, end)) / sine
+        for i in range(3):
+            out[i] *= size
+    else:
+        out[:] = 0.0
 
 
 @compiled
@@ -197,7 +202,7 @@ CAPSULE = np.dtype(
 
 
 @compiled
-def place(q: Vector, frames: Vector, axes: Vector, capsules: Records, out: Vector) -> None:  # noqa: C901, PLR0912 - one nest of loops
+def place(q: Vector, frames: Vector, axes: Vector, capsules: Records, out: Vector) -> None:
     """Write into out (N, 2, 3) the ends of a `Body`'s capsules at joints q (J,) [rad, m].
 
     The capsules are ordered by link.
@@ -208,45 +213,33 @@ def place(q: Vector, frames: Vector, axes: Vector, capsules: Records, out: Vecto
     moved = np.empty((3, 3))
     next_origin = np.empty(3)
     capsule = 0
-    count = len(capsules)
     for link in range(len(q) + 1):
         # the link's pose (turn, origin) from that of the link before
         if link > 0:
             frame = frames[link - 1]
-            for i in range(3):
-                next_origin[i] = origin[i]
-                for k in range(3):
-                    next_origin[i] += turn[i, k] * frame[k, 3]
-            slides = axes[link - 1, 3] != 0.0
-            _about(axes[link - 1], 0.0 if slides else q[link - 1], joint_turn)
-            for i in range(3):
-                for j in range(3):
-                    moved[i, j] = 0.0
-                    for k in range(3):
-                        moved[i, j] += turn[i, k] * frame[k, j]
+            axis = axes[link - 1]
+            slides = axis[3] != 0.0
+            transform(turn, origin, frame[:, 3], next_origin)
+            rotate_about(axis, 0.0 if slides else q[link - 1], joint_turn)
+            moved[:] = 0.0
+            add_product(turn, frame[:, :3], moved)
             if slides:
                 for i in range(3):
                     for k in range(3):
-                        next_origin[i] += moved[i, k] * axes[link - 1, k] * q[link - 1]
-            for i in range(3):
-                origin[i] = next_origin[i]
-                for j in range(3):
-                    turn[i, j] = 0.0
-                    for k in range(3):
-                        turn[i, j] += moved[i, k] * joint_turn[k, j]
+                        next_origin[i] += moved[i, k] * axis[k] * q[link - 1]
+            origin[:] = next_origin
+            turn[:] = 0.0
+            add_product(moved, joint_turn, turn)
 
-        while capsule < count and capsules[capsule].link == link:
+        while capsule < len(capsules) and capsules[capsule].link == link:
             for end in range(2):
-                for i in range(3):
-                    out[capsule, end, i] = origin[i]
-                    for k in range(3):
-                        out[capsule, end, i] += turn[i, k] * capsules[capsule].ends[end, k]
+                transform(turn, origin, capsules[capsule].ends[end], out[capsule, end])
             capsule += 1
 
 
 @compiled
-def _about(axis: Vector, angle: float, out: Vector) -> None:
-    """Write into out (3, 3) the rotation about a unit axis by an angle [rad]."""
+def rotate_about(axis: Vector, angle: float, out: Vector) -> None:
+    """Write into out (3, 3) the rotation about a unit axis (3,) by an angle [rad]."""
     x = axis[0]
     y = axis[1]
     z = axis[2]
@@ -424,4 +417,4 @@ def round_to(values: Vector, parts: float) -> None:
     """
     for i in range(3):
         for j in range(3):
-            values[i, j] = np.rint(values[i, j] * parts) / parts
+            values[i, j] = rounded(values[i, j], parts)

@@ -7,51 +7,31 @@ import math
 import numpy as np
 
 from kmp.compiled import compiled
-from kmp.elementary import sin_cos
 from thirdhand.core.arm.least_squares import factorise, substitute
-from thirdhand.core.frame import Records, Vector
+from thirdhand.core.frame import Records, Struct, Vector
+from thirdhand.core.geometry import rotate_about
+from thirdhand.core.vectors import add_product, cross, square, transform
 
 
 class Kinematics:
-    """The arm at some joints, as one record (1,); `Arm.at` computes it."""
+    """The arm at some joints, as one record (1,), whose fields are attributes; `Arm.at` computes
+    it.
+
+    * `joints` (J,) [rad, m].
+    * `position` (3,) [m] and `rotation` (3, 3) of the tool, frame base.
+    * `tasks` (5 or 6, J) [m]: tool velocity, and turn times lever, per joint velocity. Rows 0 to 2
+      are linear, in frame base; the others turn the tool about its own x, y (and z).
+    * `damping` of the tasks [m²].
+    * `jacobian` of the tool (6, J), linear before angular rows, frame base.
+    """
 
     __slots__ = ("record",)
 
     def __init__(self, record: Records) -> None:
         self.record = record
 
-    @property
-    def joints(self) -> Vector:
-        """Joint positions (J,) [rad, m]."""
-        return self.record["joints"][0]  # type: ignore[no-any-return]
-
-    @property
-    def position(self) -> Vector:
-        """Position of the tool (3,) [m], frame base."""
-        return self.record["position"][0]  # type: ignore[no-any-return]
-
-    @property
-    def rotation(self) -> Vector:
-        """Rotation of the tool (3, 3), frame base."""
-        return self.record["rotation"][0]  # type: ignore[no-any-return]
-
-    @property
-    def tasks(self) -> Vector:
-        """Task matrix (5 or 6, J) [m]: tool velocity, and turn times lever, per joint velocity.
-
-        Rows 0 to 2 are linear, in frame base; the others turn the tool about its own x, y (and z).
-        """
-        return self.record["tasks"][0]  # type: ignore[no-any-return]
-
-    @property
-    def damping(self) -> float:
-        """Damping of the tasks [m²]."""
-        return float(self.record["damping"][0])
-
-    @property
-    def jacobian(self) -> Vector:
-        """Jacobian of the tool (6, J), linear before angular rows, frame base."""
-        return self.record["jacobian"][0]  # type: ignore[no-any-return]
+    def __getattr__(self, field: str) -> Vector:
+        return self.record[field][0]  # type: ignore[no-any-return]
 
 
 @compiled
@@ -86,7 +66,7 @@ def tool_speeds(
 
 
 @compiled
-def tool_speed_after(heres: Records, way: Vector, dq: Vector) -> float:  # noqa: PLR0915 - one algorithm
+def tool_speed_after(kinematics: Struct, way: Vector, dq: Vector) -> float:
     """Speed of the tool [m/s] at joint velocities dq (J,), after displacements `way` (J,) [rad, m].
 
     It is exact, by the product of exponentials. A revolute joint i is a screw with axis w and
@@ -98,89 +78,57 @@ def tool_speed_after(heres: Records, way: Vector, dq: Vector) -> float:  # noqa:
 
     The speed is |sum over i of dq_i (u'_i + w'_i × tool')|.
     """
-    kinematics = heres[0]
-    joints = len(dq)
-    jacobian = kinematics.jacobian
     tool = kinematics.position
     rotation = np.eye(3)
     shift = np.zeros(3)
-    turned = np.empty((3, 3))
-    moved = np.empty(3)
     linear = np.zeros(3)
     angular = np.zeros(3)
+    origin = np.zeros(3)
+    w = np.empty(3)
+    u = np.empty(3)
     axis = np.empty(3)
     moment = np.empty(3)
     turn = np.empty((3, 3))
-    own_shift = np.empty(3)
-    for j in range(joints):
-        wx = jacobian[3, j]
-        wy = jacobian[4, j]
-        wz = jacobian[5, j]
-
-        # moment about the origin: the tool's velocity less w × tool
-        ux = jacobian[0, j] - (wy * tool[2] - wz * tool[1])
-        uy = jacobian[1, j] - (wz * tool[0] - wx * tool[2])
-        uz = jacobian[2, j] - (wx * tool[1] - wy * tool[0])
+    moved = np.empty(3)
+    for j in range(len(dq)):
+        # the moment about the origin: the tool's velocity less w × tool
+        w[:] = kinematics.jacobian[3:, j]
+        cross(w, tool, u)
+        for i in range(3):
+            u[i] = kinematics.jacobian[i, j] - u[i]
 
         # the screw as the joints before have moved it, w' and u', and its part of the speed
-        for i in range(3):
-            axis[i] = rotation[i, 0] * wx + rotation[i, 1] * wy + rotation[i, 2] * wz
-            moment[i] = rotation[i, 0] * ux + rotation[i, 1] * uy + rotation[i, 2] * uz
+        transform(rotation, origin, w, axis)
+        transform(rotation, origin, u, moment)
         linear[0] += dq[j] * (moment[0] + shift[1] * axis[2] - shift[2] * axis[1])
         linear[1] += dq[j] * (moment[1] + shift[2] * axis[0] - shift[0] * axis[2])
         linear[2] += dq[j] * (moment[2] + shift[0] * axis[1] - shift[1] * axis[0])
         for i in range(3):
             angular[i] += dq[j] * axis[i]
 
-        # exp(screw way): the rotation `turn`, with the shift `own_shift`
-        s, c = sin_cos(way[j])
-        turns = wx * wx + wy * wy + wz * wz > 0.5
-        if not turns:
-            c = 1.0
-            s = 0.0
-        v = 1.0 - c
-        turn[0, 0] = c + v * wx * wx
-        turn[0, 1] = v * wx * wy - s * wz
-        turn[0, 2] = v * wx * wz + s * wy
-        turn[1, 0] = v * wx * wy + s * wz
-        turn[1, 1] = c + v * wy * wy
-        turn[1, 2] = v * wy * wz - s * wx
-        turn[2, 0] = v * wx * wz - s * wy
-        turn[2, 1] = v * wy * wz + s * wx
-        turn[2, 2] = c + v * wz * wz
+        # exp(screw way): the rotation `turn`, and the shift, which replaces the moment
+        turns = square(w) > 0.5
+        rotate_about(w, way[j] if turns else 0.0, turn)
         if turns:  # about the point o = w × u of the axis: o - turn o
-            ox = wy * uz - wz * uy
-            oy = wz * ux - wx * uz
-            oz = wx * uy - wy * ux
-            own_shift[0] = ox - (turn[0, 0] * ox + turn[0, 1] * oy + turn[0, 2] * oz)
-            own_shift[1] = oy - (turn[1, 0] * ox + turn[1, 1] * oy + turn[1, 2] * oz)
-            own_shift[2] = oz - (turn[2, 0] * ox + turn[2, 1] * oy + turn[2, 2] * oz)
+            cross(w, u, axis)
+            transform(turn, origin, axis, moment)
+            for i in range(3):
+                moment[i] = axis[i] - moment[i]
         else:
-            own_shift[0] = ux * way[j]
-            own_shift[1] = uy * way[j]
-            own_shift[2] = uz * way[j]
+            for i in range(3):
+                moment[i] = u[i] * way[j]
 
         # (R, s), with this joint's motion after those before
-        for i in range(3):
-            moved[i] = shift[i]
-            for k in range(3):
-                moved[i] += rotation[i, k] * own_shift[k]
-                turned[i, k] = (
-                    rotation[i, 0] * turn[0, k]
-                    + rotation[i, 1] * turn[1, k]
-                    + rotation[i, 2] * turn[2, k]
-                )
-        rotation[:] = turned
+        transform(rotation, shift, moment, moved)
         shift[:] = moved
+        before = rotation.copy()
+        rotation[:] = 0.0
+        add_product(before, turn, rotation)
 
     # the tool, moved by all joints
+    transform(rotation, origin, tool, moved)
     for i in range(3):
-        moved[i] = (
-            rotation[i, 0] * tool[0]
-            + rotation[i, 1] * tool[1]
-            + rotation[i, 2] * tool[2]
-            + shift[i]
-        )
+        moved[i] += shift[i]
     x = linear[0] + angular[1] * moved[2] - angular[2] * moved[1]
     y = linear[1] + angular[2] * moved[0] - angular[0] * moved[2]
     z = linear[2] + angular[0] * moved[1] - angular[1] * moved[0]

@@ -44,6 +44,36 @@ def times(matrix: Vector, vector: Vector) -> Vector:
 
 
 @compiled
+def add_product(left: Vector, right: Vector, out: Vector) -> None:
+    """Add to `out` (N, M) the product of two matrices (N, K) and (K, M)."""
+    for row in range(len(left)):
+        for column in range(right.shape[1]):
+            total = out[row, column]
+            for k in range(len(right)):
+                total += left[row, k] * right[k, column]
+            out[row, column] = total
+
+
+@compiled
+def transform(
+    turn: Vector, origin: Vector, point: Vector | tuple[float, float, float], out: Vector
+) -> None:
+    """Write into out (3,) a point (3,) after a rotation (3, 3) and a shift: origin + turn point."""
+    for row in range(3):
+        out[row] = origin[row]
+        for k in range(3):
+            out[row] += turn[row, k] * point[k]
+
+
+@compiled
+def cross(a: Vector, b: Vector, out: Vector) -> None:
+    """Write into out (3,) the cross product a × b."""
+    out[0] = a[1] * b[2] - a[2] * b[1]
+    out[1] = a[2] * b[0] - a[0] * b[2]
+    out[2] = a[0] * b[1] - a[1] * b[0]
+
+
+@compiled
 def squared_distance(a: Vector, b: Vector) -> float:
     """|a - b|²."""
     total = 0.0

@@ -24,7 +24,6 @@ from thirdhand.core.frame import (
     order,
     state_layout,
 )
-from thirdhand.core.intake.arm_samples import still_ticks
 from thirdhand.core.intake.hand_estimator import STILL
 from thirdhand.core.intake.stage import Intake
 from thirdhand.core.limiter.stage import Limiter, LimiterStage
@@ -134,7 +133,7 @@ def _follow(settings: Settings, skill: Skill, other: Skill, urdf: str) -> None:
     settings = msgspec.structs.replace(settings, arm=arm)
     controller = Controller(settings, skill, urdf=urdf)
     names = settings.joints.names
-    trusted = still_ticks(settings)
+    trusted = int(controller.intake.parameters["still_ticks"][0])
     change = trusted + FOLLOWED_TICKS
     count = trusted + 2 * FOLLOWED_TICKS
     controller.step(Tick(0))

@@ -13,6 +13,7 @@ from statistics import median
 from typing import Any
 
 import msgspec
+import numpy as np
 
 from thirdhand.contract.evidence import (
     LONGEST_NAME,
@@ -41,15 +42,16 @@ from thirdhand.contract.messages import (
 )
 from thirdhand.contract.records import SOURCES, Cause
 from thirdhand.contract.requests import Source
+from thirdhand.core.codes import TRUSTED
 from thirdhand.core.controller import Controller
 from thirdhand.core.frame import Record
-from thirdhand.core.intake.far_away import too_far, unit_meant
-from thirdhand.core.intake.late_samples import lateness_ms
+from thirdhand.core.intake import KEPT
 from thirdhand.core.intake.stage import Intake, Refused
 from thirdhand.core.tuning import TUNING
 from thirdhand.core.wish.stage import wish_frames
 from thirdhand.core.wish.step import newest_due
 from thirdhand.daemon.cell_streams import Arrivals, heard
+from thirdhand.daemon.far_away import too_far, unit_meant
 from thirdhand.daemon.side_streams import side_keys
 from thirdhand.settings.config import JointSettings, Settings
 
@@ -257,6 +259,17 @@ class InputMonitor:
                 yield f"{name}: rejected in the last {now_s - self._counted_s:.0f} s: {causes}"
         if is_due:
             self._counted_s = now_s
+
+
+def lateness_ms(state: Record, side: int, period_s: float) -> tuple[float, float] | None:
+    """Delay of a hand's retained samples above the minimum delay, mean and 95th percentile [ms];
+    None while the tracker's clock is not trusted.
+    """
+    if state["clock"][side] != TRUSTED or not state["kept"][side]:
+        return None
+    newest = (int(state["kept_newest"][side]) - np.arange(int(state["kept"][side]))) % KEPT
+    late_ms = 1e3 * period_s * state["kept_late"][side][newest]
+    return float(np.mean(late_ms)), float(np.percentile(late_ms, 95))
 
 
 def _rejected(name: str, arrivals: Arrivals, intake: Intake | None) -> dict[str, int]:

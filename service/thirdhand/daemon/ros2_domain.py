@@ -19,9 +19,9 @@ from thirdhand.contract import cdr, ros2
 from thirdhand.contract.incidents import in_brief, in_full
 from thirdhand.contract.messages import in_order
 from thirdhand.core.frame import Frame, Record
-from thirdhand.core.transforms import Frames
 from thirdhand.daemon import supervised_thread
 from thirdhand.daemon.clock import run_beside_real_time
+from thirdhand.recordings.transforms import Frames
 from thirdhand.settings.arm_description import description
 from thirdhand.settings.config import Settings, urdf_path
 

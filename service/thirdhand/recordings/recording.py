@@ -28,10 +28,10 @@ from thirdhand.contract.explain import InvalidError, in_words, validated
 from thirdhand.contract.images import COMPRESSED_IMAGE, CompressedImage, decode_image
 from thirdhand.contract.messages import SceneObject, WireError
 from thirdhand.core.frame import Outputs, Record, Tick, encode
-from thirdhand.core.transforms import Frames
 from thirdhand.recordings.mcap_file import McapFile, RecordingError, ends_early, existing, machine
 from thirdhand.recordings.mcap_reader import FileFault, Messages, full_name
 from thirdhand.recordings.steps import REPLAYED, Gap, Step, checksum, steps
+from thirdhand.recordings.transforms import Frames
 from thirdhand.recordings.urdf_markers import with_markers
 from thirdhand.settings.config import Settings, robot_description, without_secrets
 

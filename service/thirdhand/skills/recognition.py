@@ -1,4 +1,6 @@
-"""Segments of a whole take at once, by the functions with which a cell recognises them."""
+"""Segments and stillness of a whole take at once, by the functions with which a cell recognises
+them.
+"""
 
 from __future__ import annotations
 
@@ -7,8 +9,10 @@ from numpy.typing import NDArray
 
 from kmp.compiled import compiled
 from thirdhand.core.frame import Records, Vector
+from thirdhand.core.intake.hand_estimator import smoothing, stillness_after
 from thirdhand.core.skill.segments import add_followed, along_both, on_way, recognise
 from thirdhand.core.skill.tuning import FIRST_SEGMENT_ODDS
+from thirdhand.core.tuning import TUNING
 
 
 @compiled
@@ -51,3 +55,19 @@ def all_followed(
     """
     for t in range(len(hands)):
         add_followed(hands[t], shares[t], segments[labels[t]], out[t])
+
+
+def stillness_of(velocities: Vector, period_s: float) -> Vector:
+    """Stillness (T, 2) of both hands with the velocities (T, 6) [m/s]. Both start still."""
+    out = np.empty((len(velocities), 2))
+    stillness = np.ones(2)
+    gains = smoothing(period_s)
+    still_mps = TUNING.intake.hand_still_mps
+    lowpass = np.zeros((2, 3))
+    for row, velocity in zip(out, np.ascontiguousarray(velocities).reshape(-1, 2, 3), strict=True):
+        for side in (0, 1):
+            stillness[side] = stillness_after(
+                velocity[side], gains, still_mps, lowpass[side], stillness[side]
+            )
+        row[:] = stillness
+    return out

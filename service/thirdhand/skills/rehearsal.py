@@ -6,7 +6,6 @@ import numpy as np
 
 from kmp import KMP, GaussianKernel, Gaussians
 from kmp.arrays.immutable import frozen
-from thirdhand.core.intake.hand_estimator import stillness_of
 from thirdhand.core.skill import ORDER
 from thirdhand.core.skill.hands_kmp import HandsKMP
 from thirdhand.core.skill.memory import along
@@ -15,7 +14,7 @@ from thirdhand.core.skill.segments import MOST_SEGMENTS, SEGMENT
 from thirdhand.core.skill.step import recent
 from thirdhand.core.skill.support import LocalErrors, error_probability
 from thirdhand.core.skill.task_clock import BEGIN_AT, counted
-from thirdhand.skills.recognition import all_followed, covered, recognised
+from thirdhand.skills.recognition import all_followed, covered, recognised, stillness_of
 
 SAMPLE_PERIOD_S = 0.01
 

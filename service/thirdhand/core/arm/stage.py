@@ -13,7 +13,6 @@ from thirdhand.core.arm.step import NEAR, SEPARATED, SPEED, describe, follow, jo
 from thirdhand.core.frame import RECORDS, Record, Vector, as_array, parameters, shared_dtype
 from thirdhand.core.joint_limits import LIMIT_MARGIN_RAD, acceleration_rate, approach_gain
 from thirdhand.core.kinematics import Kinematics, joint_costs
-from thirdhand.core.kinematics import tool_speeds as _tool_speeds
 from thirdhand.core.numerics import ROTATION_DECIMALS
 from thirdhand.core.separation.stage import Separation
 from thirdhand.core.tuning import TUNING, Tuning
@@ -37,18 +36,6 @@ class Solution(NamedTuple):
     separated: bool
 
 
-class Closing(NamedTuple):
-    """Approach of the tool to a distant position.
-
-    `braking` [m/s²] and `speed` [m/s] limit the closing speed; `far_damping` [s²] damps the joints
-    when the position is out of reach.
-    """
-
-    braking: float
-    speed: float
-    far_damping: float
-
-
 class ArmStage:
     """The arm that a URDF describes, with a tool on its plate.
 
@@ -56,14 +43,7 @@ class ArmStage:
     settings; all other joints of the description stay at 0.
     """
 
-    def __init__(
-        self,
-        settings: Settings,
-        urdf: str,
-        closing: Closing | None = None,
-        *,
-        tuning: Tuning = TUNING,
-    ) -> None:
+    def __init__(self, settings: Settings, urdf: str, *, tuning: Tuning = TUNING) -> None:
         numbers = tuning.arm
         self._model = pin.buildModelFromXML(Urdf(urdf).kinematics(settings.joints.names))
         plate = self._model.frames[self._model.getBodyId(settings.arm.plate)]
@@ -92,11 +72,7 @@ class ArmStage:
         top = settings.tool.max_speed
         limits = settings.joints
         size = settings.reach.outer / Reach().outer  # of the arm, relative to the WAM
-        closing = closing or Closing(
-            numbers.closing_brake_share * settings.tool.stop_acceleration,
-            min(top, numbers.closing_speed_mps),
-            numbers.far_damping_s2,
-        )
+        closing_speed = float(min(top, numbers.closing_speed_mps))
         joints = len(limits.names)
         acceleration = np.array(limits.acceleration)
         # weights of the joints, with a geometric mean of 1; and shares of motion, with a mean of 1
@@ -112,10 +88,10 @@ class ArmStage:
 
         self.parameters = parameters(
             period_s=settings.period_s,
-            closing_braking=closing.braking,
-            closing_speed=float(closing.speed),
-            far_damping=closing.far_damping,
-            far_speed=0.5 * closing.speed,
+            closing_braking=numbers.closing_brake_share * settings.tool.stop_acceleration,
+            closing_speed=closing_speed,
+            far_damping=numbers.far_damping_s2,
+            far_speed=0.5 * closing_speed,
             constrained_speed=2.0 * tuning.separation.slip_speed_mps,
             max_tool_speed=numbers.tool_speed_share * top,
             max_turn_speed=float(settings.tool.max_turn_speed),
@@ -190,15 +166,6 @@ class ArmStage:
         out = np.empty((3, 3, len(self._jerk)))
         joint_costs(self.parameters, here.record, out)
         return out
-
-    def speeds(self, here: Kinematics, dq: Vector, ddq: Vector) -> tuple[float, float]:
-        """Speed of the tool [m/s], and its maximum as the joints' accelerations are ended.
-
-        The maximum is the larger one of the speed now, and the speed once each joint has brought
-        its acceleration to 0. Joint velocities and accelerations are (J,) [rad/s, rad/s²].
-        """
-        now, crest, _ = _tool_speeds(here.record, dq, ddq, self._jerk)
-        return now, crest
 
     def follow(self, state: Record, here: Kinematics, separation: Separation) -> Solution:
         """Joint velocities that move the tool to the state's setpoint; see `step`. While the

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from kmp.compiled import compiled
 from kmp.elementary import sin_cos
 from thirdhand.core.arm.least_squares import solve
-from thirdhand.core.frame import Records, Vector
-from thirdhand.core.geometry import ROUND_TO, quaternion_of, swing, turn_between
+from thirdhand.core.frame import Records, Struct, Vector
+from thirdhand.core.geometry import quaternion_of, rounded, swing, turn_between
 from thirdhand.core.numerics import MAX_ERROR_M, MAX_JOINT_RAD, ROUNDING
 from thirdhand.core.vectors import dot, norm, square
 
@@ -183,14 +183,14 @@ def joint_step(
 
     # The programme: what the tool shall do, what the joints can do, and what separation allows.
     wish = np.empty(task_count)
-    damping = kinematics.damping + _wish(arms, heres, goals, wish)
+    damping = kinematics.damping + _wish(arm, kinematics, goals[0], wish)
     scaled = np.empty((task_count, joints))
     home = np.empty(joints)
     bounds = np.empty((2, joints))
-    flags = _bound_joints(arms, heres, scaled, home, bounds)
+    flags = _bound_joints(arm, kinematics, scaled, home, bounds)
     rows = np.empty((count, joints))
     limits = np.empty(count)
-    _separate(arms, constraints, rows, limits)
+    _separate(arm, constraints, rows, limits)
 
     velocity = out[0]
     is_constrained = solve(scaled, wish, home, damping, bounds, rows, limits, velocity)
@@ -206,41 +206,39 @@ def joint_step(
 
     # If the joints cannot reach this soon, the turn is reduced, so that the position is kept. This
     # mixes two solutions, and a mixture need not keep separation's rows.
-    is_reachable = _can_have(arms, goals, velocity)
+    is_reachable = _can_have(arm, goals[0], velocity)
     scaled[3:] = 0.0
     wish[3:] = 0.0
     if not is_reachable and not is_constrained:
         without_turn = np.empty(joints)
-        _brake_idle(arms, goals, home)
+        _brake_idle(arm, goals[0], home)
         solve(scaled, wish, home, damping, bounds, rows, limits, without_turn)
-        _turn_less(arms, goals, velocity, without_turn)
-    excess = _excess(arms, velocity)
+        _turn_less(arm, goals[0], velocity, without_turn)
+    excess = _excess(arm, velocity)
 
     # The accelerations: the same programme, without turn and separation.
-    _wish_acceleration(arms, goals, wish, home, bounds)
+    _wish_acceleration(arm, goals[0], wish, home, bounds)
     solve(scaled, wish, home, damping, bounds, rows[:0], limits[:0], out[1])
 
     for j in range(joints):
         speed = 0.0 if math.isnan(excess) else velocity[j] * arm.scale[j] / max(excess, 1.0)
-        velocity[j] = np.rint(speed * ROUND_TO) / ROUND_TO
-        out[1, j] = np.rint(out[1, j] * arm.scale[j] * ROUND_TO) / ROUND_TO
+        velocity[j] = rounded(speed)
+        out[1, j] = rounded(out[1, j] * arm.scale[j])
     return flags | SPEED if excess > 1.0 + ROUNDING else flags
 
 
 @compiled
-def _separate(arms: Records, constraints: Records, rows: Vector, limits: Vector) -> None:
+def _separate(arm: Struct, constraints: Records, rows: Vector, limits: Vector) -> None:
     """Write the `rows` (K, J) of K constraints, times `scale`, and their `limits` (K,) [m/s]."""
     for k in range(len(rows)):
         limits[k] = constraints[k].planned
         for j in range(rows.shape[1]):
-            rows[k, j] = constraints[k].row[j] * arms[0].scale[j]
+            rows[k, j] = constraints[k].row[j] * arm.scale[j]
 
 
 @compiled
-def _brake_idle(arms: Records, goals: Records, home: Vector) -> None:
+def _brake_idle(arm: Struct, goal: Struct, home: Vector) -> None:
     """Write the velocities (J,) of joints that brake, divided by `scale`."""
-    arm = arms[0]
-    goal = goals[0]
     for j in range(len(home)):
         brake = arm.idle_brake_share * arm.period_s * arm.acceleration[j]
         home[j] = (goal.moving[j] - min(max(goal.moving[j], -brake), brake)) / arm.scale[j]
@@ -248,13 +246,12 @@ def _brake_idle(arms: Records, goals: Records, home: Vector) -> None:
 
 @compiled
 def _wish_acceleration(
-    arms: Records, goals: Records, wish: Vector, home: Vector, bounds: Vector
+    arm: Struct, goal: Struct, wish: Vector, home: Vector, bounds: Vector
 ) -> None:
     """Write the programme of the accelerations: the goal's for the tool, 0 for the joints, and the
     joints' limits, divided by `scale`.
     """
-    arm = arms[0]
-    wish[:3] = goals[0].acceleration
+    wish[:3] = goal.acceleration
     home[:] = 0.0
     for j in range(len(home)):
         bounds[1, j] = arm.acceleration[j] / arm.scale[j]
@@ -262,13 +259,10 @@ def _wish_acceleration(
 
 
 @compiled
-def _wish(arms: Records, heres: Records, goals: Records, wish: Vector) -> float:
+def _wish(arm: Struct, kinematics: Struct, goal: Struct, wish: Vector) -> float:
     """Write the target velocities (v; l R^T w) of `joint_step`; return the damping far from the
     goal.
     """
-    arm = arms[0]
-    kinematics = heres[0]
-    goal = goals[0]
     linear = np.empty(3)
     error = np.empty(3)
     for i in range(3):
@@ -289,7 +283,7 @@ def _wish(arms: Records, heres: Records, goals: Records, wish: Vector) -> float:
 
     turn = np.empty(3)
     turn_rows = len(wish) - 3
-    _turn(arms, kinematics.rotation, goal.orientation, goal.turning, turn_rows == 3, turn)
+    _turn(arm, kinematics.rotation, goal.orientation, goal.turning, turn_rows == 3, turn)
     wish[:3] = linear
     wish[3:] = 0.0
     for i in range(turn_rows):
@@ -302,13 +296,11 @@ def _wish(arms: Records, heres: Records, goals: Records, wish: Vector) -> float:
 
 @compiled
 def _bound_joints(
-    arms: Records, heres: Records, scaled: Vector, home: Vector, bounds: Vector
+    arm: Struct, kinematics: Struct, scaled: Vector, home: Vector, bounds: Vector
 ) -> int:
     """Write T (N, J), h (J,) and the bounds (2, J) on x of `joint_step`; return NEAR if a joint is
     near its limit, else 0.
     """
-    arm = arms[0]
-    kinematics = heres[0]
     flags = 0
     for j in range(len(home)):
         below = kinematics.joints[j] - arm.lower[j]
@@ -342,24 +334,22 @@ def _missing(tasks: Vector, wanted: Vector, x: Vector) -> float:
 
 
 @compiled
-def _excess(arms: Records, out: Vector) -> float:
+def _excess(arm: Struct, out: Vector) -> float:
     """Largest ratio of a joint's speed to its limit; NaN if a velocity is not finite."""
     excess = 0.0
     for j in range(len(out)):
         if not math.isfinite(out[j]):
             return math.nan
-        excess = max(excess, abs(out[j] * arms[0].scale[j]) / arms[0].max_velocity[j])
+        excess = max(excess, abs(out[j] * arm.scale[j]) / arm.max_velocity[j])
     return excess
 
 
 @compiled
-def _can_have(arms: Records, goals: Records, out: Vector) -> bool:
+def _can_have(arm: Struct, goal: Struct, out: Vector) -> bool:
     """True if the joints can reach the velocities of a solution (J,) within horizon_s.
 
     |S x| <= max_velocity    and    |S x - moving| <= horizon_s acceleration
     """
-    arm = arms[0]
-    goal = goals[0]
     for j in range(len(out)):
         velocity = out[j] * arm.scale[j]
         change = goal.horizon_s * arm.acceleration[j]
@@ -369,7 +359,7 @@ def _can_have(arms: Records, goals: Records, out: Vector) -> bool:
 
 
 @compiled
-def _turn_less(arms: Records, goals: Records, out: Vector, free: Vector) -> None:
+def _turn_less(arm: Struct, goal: Struct, out: Vector, free: Vector) -> None:
     """Move a solution x (J,) toward `free` (J,) until the joints can reach its velocities.
 
         x = free + share (x - free)
@@ -378,8 +368,6 @@ def _turn_less(arms: Records, goals: Records, out: Vector, free: Vector) -> None
     in horizon_s, or no further outside than at `free`. `free` is the solution in which the tool may
     turn as it likes.
     """
-    arm = arms[0]
-    goal = goals[0]
     share = 1.0
     for j in range(len(out)):
         free_velocity = free[j] * arm.scale[j]
@@ -398,7 +386,7 @@ def _turn_less(arms: Records, goals: Records, out: Vector, free: Vector) -> None
 
 @compiled
 def _turn(
-    arms: Records, rotation: Vector, orientation: Vector, turning: Vector, about: bool, out: Vector
+    arm: Struct, rotation: Vector, orientation: Vector, turning: Vector, about: bool, out: Vector
 ) -> None:
     """Write into out (3,) [rad/s] the angular velocity that turns the tool to an orientation (4,).
 
@@ -408,14 +396,14 @@ def _turn(
     turn of +z to its +z. The result is 0 if it is not finite.
     """
     quaternion = np.empty(4)
-    max_speed = arms[0].max_turn_speed
+    max_speed = arm.max_turn_speed
     if about:
         quaternion_of(rotation, quaternion)
         turn_between(quaternion, orientation, out)
     else:
         swing(rotation[:, 2].copy(), orientation, out)
     for i in range(3):
-        out[i] = arms[0].turn_gain * out[i] + turning[i]
+        out[i] = arm.turn_gain * out[i] + turning[i]
     turn = square(out)
     if not turn < math.inf:
         out[:] = 0.0

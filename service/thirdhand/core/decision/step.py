@@ -17,6 +17,7 @@ from thirdhand.core.codes import (
     CLUTCH,
     CLUTCH_RELEASED,
     CONTESTED,
+    EITHER_UNSEEN,
     FAR,
     FAULT,
     FOLLOW,
@@ -44,7 +45,6 @@ from thirdhand.core.codes import (
     TOOL_SPEED,
     TWO_SOURCES,
     UNREACHABLE_WISH,
-    UNSEEN,
     UNSEEN_HAND_NEEDED,
     WISH_JUMPED,
     WISH_LEADS,
@@ -52,8 +52,8 @@ from thirdhand.core.codes import (
     WISH_SILENT,
     WISH_UNKNOWN,
 )
-from thirdhand.core.frame import Records, Vector
-from thirdhand.core.vectors import distance
+from thirdhand.core.frame import Records, Struct, Vector
+from thirdhand.core.vectors import distance, norm, times
 
 
 @compiled
@@ -81,15 +81,15 @@ def step(
     error = -1.0
     speed = -1.0
     if state.mode != FAULT:
-        starts, fault, error, speed = _arm(states, heres, parameters, conditions)
+        starts, fault, error, speed = _arm(state, heres[0], parameters[0], conditions)
         if fault != NONE:
             state.mode = FAULT
             state.reason = fault
         else:
-            _note_hold(states, conditions)
-            reason = _why_hold(states, parameters, conditions, gate_m, threshold)
+            _note_hold(state, conditions)
+            reason = _why_hold(state, parameters[0], conditions, gate_m, threshold)
             if reason == NONE:
-                state.stuck = _stuck(states, frames, heres, parameters)
+                state.stuck = _stuck(state, frame, heres[0], parameters[0])
                 reason = BLOCKED if state.stuck == HELD else NONE
             state.mode = FOLLOW if reason == NONE else HOLD
             state.reason = reason
@@ -102,7 +102,7 @@ def step(
 
 @compiled
 def _why_hold(
-    states: Records, parameters: Records, conditions: int, gate_m: float, threshold: float
+    state: Struct, config: Struct, conditions: int, gate_m: float, threshold: float
 ) -> int:
     """The first reason for a hold in this order, or NONE:
 
@@ -122,8 +122,6 @@ def _why_hold(
     * FAR: gate_m > threshold; after a tick that held for this reason, gate_m > end_share threshold.
     * AMBIGUOUS: the segment of the task is not known.
     """
-    state = states[0]
-    config = parameters[0]
     if conditions & CONTESTED:
         return TWO_SOURCES
     if conditions & ARM_GUIDED and not config.is_assumed:
@@ -141,7 +139,7 @@ def _why_hold(
     jumped_s = (state.tick - jump_tick) * config.period_s
     if state.mode != FOLLOW and jump_tick > 0 and jumped_s < config.jumpy_s:
         return FAR
-    reason = _unseen_reason(states, conditions, gate_m)
+    reason = _unseen_reason(state, conditions, gate_m)
     ease = config.end_share if state.reason == FAR else 1.0
     if reason == NONE and gate_m > ease * threshold:
         return FAR
@@ -163,19 +161,18 @@ def _wish_reason(conditions: int) -> int:
 
 
 @compiled
-def _unseen_reason(states: Records, conditions: int, gate_m: float) -> int:
+def _unseen_reason(state: Struct, conditions: int, gate_m: float) -> int:
     """NO_HANDS or STALE_HAND of `_why_hold`, or NONE."""
-    state = states[0]
     if math.isnan(gate_m):
         is_never_seen = min(state.hand_ticks[0], state.hand_ticks[1]) < 0
         return NO_HANDS if is_never_seen and not conditions & ONE_HAND else STALE_HAND
     is_needed = conditions & UNSEEN_HAND_NEEDED or state.mode != FOLLOW
-    return STALE_HAND if conditions & sum(UNSEEN) and is_needed else NONE
+    return STALE_HAND if conditions & EITHER_UNSEEN and is_needed else NONE
 
 
 @compiled
 def _arm(
-    states: Records, heres: Records, parameters: Records, conditions: int
+    state: Struct, kinematics: Struct, config: Struct, conditions: int
 ) -> tuple[int, int, float, float]:
     """Update the state of the arm: it starts, is no longer ready, or causes a fault. Returns
     STARTS_ASSUMED, STARTS_MEASURED or 0; the reason of a fault, or NONE; and `measured_error`, or
@@ -193,8 +190,6 @@ def _arm(
     * A joint farther than `max_error_rad` from its command is a fault (ARM_ERROR).
     * A tool faster than `fault_speed` for more than too_fast_s is a fault (TOOL_SPEED).
     """
-    state = states[0]
-    config = parameters[0]
     if config.is_assumed:
         starts = 0 if state.arm_ready else STARTS_ASSUMED
         state.arm_ready = READY
@@ -208,16 +203,16 @@ def _arm(
         state.stuck = state.way_count = 0
         return 0 if is_moving else STARTS_MEASURED, NONE, -1.0, -1.0
     if not state.arm_ready:
-        return _start(states, parameters, conditions, is_moving), NONE, -1.0, -1.0
+        return _start(state, config, conditions, is_moving), NONE, -1.0, -1.0
     if not conditions & ARM_HEARD:
         if state.mode == FOLLOW or is_moving:
             return 0, ARM_SILENT, -1.0, -1.0
         state.arm_ready = 0
         return 0, NONE, -1.0, -1.0
     if state.arm_ready == RETURNING:
-        _return(states, parameters, conditions, is_moving)
+        _return(state, config, conditions, is_moving)
 
-    error, speed = measured_error(states, heres, parameters)
+    error, speed = measured_error(state, kinematics, config)
     if error > config.max_error_rad:
         return 0, ARM_ERROR, error, speed
     if speed <= config.fault_speed:
@@ -236,9 +231,8 @@ def _is_commanded_to_move(joints: Vector) -> bool:
 
 
 @compiled
-def _start(states: Records, parameters: Records, conditions: int, is_moving: bool) -> int:
+def _start(state: Struct, config: Struct, conditions: int, is_moving: bool) -> int:
     """STARTS_MEASURED if an arm that is not ready starts, else 0; see `_arm`."""
-    state = states[0]
     is_inside = conditions & ARM_INSIDE
     is_still = conditions & ARM_STILL
     state.stuck = state.way_count = 0
@@ -247,18 +241,16 @@ def _start(states: Records, parameters: Records, conditions: int, is_moving: boo
     # Commanded joints that move come to rest first; the reported posture must be constant.
     if not is_still or is_moving or (is_inside and not state.leaves):
         return 0
-    is_returning = is_inside or _is_outside(state.measured, parameters)
+    is_returning = is_inside or _is_outside(state.measured, config)
     state.arm_ready = RETURNING if is_returning else READY
     state.slow_tick = state.stuck_tick = state.tick
     return STARTS_MEASURED
 
 
 @compiled
-def _return(states: Records, parameters: Records, conditions: int, is_moving: bool) -> None:
+def _return(state: Struct, config: Struct, conditions: int, is_moving: bool) -> None:
     """Let a RETURNING arm become READY, see `_arm`."""
-    state = states[0]
-    config = parameters[0]
-    if _is_outside(state.joints[0], parameters):
+    if _is_outside(state.joints[0], config):
         return
     if is_moving:
         state.stuck_tick = state.tick
@@ -269,30 +261,26 @@ def _return(states: Records, parameters: Records, conditions: int, is_moving: bo
 
 
 @compiled
-def _note_hold(states: Records, conditions: int) -> None:
+def _note_hold(state: Struct, conditions: int) -> None:
     """Store hands and segment at the start of an operator's hold; its end clears them.
 
     The segment is the most probable one, if its probability is above 1/2.
     """
-    state = states[0]
     if state.operator_hold and not state.held:
-        state.held = (
-            HELD_SEEN if conditions & HANDS_KNOWN and not conditions & sum(UNSEEN) else HELD_UNSEEN
-        )
+        is_seen = conditions & HANDS_KNOWN and not conditions & EITHER_UNSEEN
+        state.held = HELD_SEEN if is_seen else HELD_UNSEEN
         state.held_tick = state.tick
         state.held_segment = -1
-        for side in range(2):
-            for axis in range(3):
-                state.held_hands[side, axis] = state.hands[side, 0, axis]
-        for segment in range(len(state.segment_belief)):
-            if state.segment_belief[segment] > 0.5:
-                state.held_segment = segment
+        state.held_hands[:] = state.hands[:, 0]
+        most = state.segment_belief.argmax()
+        if state.segment_belief[most] > 0.5:
+            state.held_segment = most
     elif not state.operator_hold:
         state.held = 0
 
 
 @compiled
-def _stuck(states: Records, frames: Records, heres: Records, parameters: Records) -> int:
+def _stuck(state: Struct, frame: Struct, kinematics: Struct, config: Struct) -> int:
     """Progress of the tool toward its target: HELD while the arm waits or moves along a way out,
     NOTICED when the tool has come no nearer for stuck_s, else 0.
 
@@ -309,10 +297,7 @@ def _stuck(states: Records, frames: Records, heres: Records, parameters: Records
     `way_timeout_s` has passed. If none was found, or one has been tried since the tool was at a
     target, it lasts until the target or a hand has moved by another_target_m.
     """
-    state = states[0]
-    frame = frames[0]
-    tool = heres[0].position
-    config = parameters[0]
+    tool = kinematics.position
     gap = distance(frame.target, tool)
     moved = distance(frame.target, state.stuck_target)
     passed_s = (state.tick - state.stuck_tick) * config.period_s
@@ -345,8 +330,7 @@ def _stuck(states: Records, frames: Records, heres: Records, parameters: Records
         state.stuck_tick = state.tick
         state.stuck_gap = gap
         state.stuck_target[:] = frame.target
-        for side in range(2):
-            state.stuck_hands[side] = state.hands[side, 0]
+        state.stuck_hands[:] = state.hands[:, 0]
         if gap < config.stuck_gap_m or moved > config.stuck_gap_m:
             state.way_tried = 0
         return 0
@@ -354,18 +338,16 @@ def _stuck(states: Records, frames: Records, heres: Records, parameters: Records
 
 
 @compiled
-def _is_outside(joints: Vector, parameters: Records) -> bool:
+def _is_outside(joints: Vector, config: Struct) -> bool:
     """True if a joint (J,) [rad] is outside its limits."""
-    outside = False
     for j in range(len(joints)):
-        outside = (
-            outside or joints[j] < parameters[0].lower[j] or joints[j] > parameters[0].upper[j]
-        )
-    return outside
+        if joints[j] < config.lower[j] or joints[j] > config.upper[j]:
+            return True
+    return False
 
 
 @compiled
-def measured_error(states: Records, heres: Records, parameters: Records) -> tuple[float, float]:
+def measured_error(state: Struct, kinematics: Struct, config: Struct) -> tuple[float, float]:
     """Largest joint error [rad] and speed of the tool [m/s], as measured:
 
         error = max_j |q_j - measured_j| / per_rad_j,   speed = |J_p measured_velocities|
@@ -373,17 +355,10 @@ def measured_error(states: Records, heres: Records, parameters: Records) -> tupl
     q and J_p, the first three rows of `tasks`, are the commanded joints (J,) and the tool's
     Jacobian there.
     """
-    state = states[0]
-    kinematics = heres[0]
-    error = speed = 0.0
+    error = 0.0
     for joint in range(len(kinematics.joints)):
         error = max(
             error,
-            abs(kinematics.joints[joint] - state.measured[joint]) / parameters[0].per_rad[joint],
+            abs(kinematics.joints[joint] - state.measured[joint]) / config.per_rad[joint],
         )
-    for axis in range(3):
-        along = 0.0
-        for joint in range(len(kinematics.joints)):
-            along += kinematics.tasks[axis, joint] * state.measured_velocities[joint]
-        speed += along * along
-    return error, math.sqrt(speed)
+    return error, norm(times(kinematics.tasks[:3], state.measured_velocities))

@@ -11,9 +11,8 @@ import math
 import numpy as np
 
 from kmp.compiled import compiled
-from thirdhand.core.frame import Records, Vector
-from thirdhand.core.tuning import TUNING, Tuning
-from thirdhand.settings.config import JointSettings, Settings
+from thirdhand.core.frame import Struct, Vector
+from thirdhand.settings.config import JointSettings
 
 TURN = 2.0 * math.pi
 
@@ -26,14 +25,9 @@ def in_turn(joints: JointSettings, position: Vector, near: Vector) -> Vector:
     return position + np.where(is_continuous, TURN * np.rint((near - position) / TURN), 0.0)
 
 
-def still_ticks(settings: Settings, tuning: Tuning = TUNING) -> int:
-    """Number of ticks for which an arm must report one posture before it is accepted as at rest."""
-    return settings.ticks_in(tuning.intake.max_late_s)
-
-
 @compiled
 def compared(
-    states: Records, parameters: Records, position: Vector, velocity: Vector
+    state: Struct, config: Struct, position: Vector, velocity: Vector
 ) -> tuple[bool, float, float]:
     """Plausibility of joint positions and velocities (J,) [rad, rad/s], and their differences from
     earlier samples.
@@ -42,27 +36,23 @@ def compared(
     the largest difference from the newest sample [rad]; and from `arm_still_posture` [rad].
     Differences are divided by `per_rad`.
     """
-    state = states[0]
-    config = parameters[0]
+    low, high = config.plausible_joints
     plausible = True
     deviation = 0.0
     moved = 0.0
     for i in range(len(position)):
-        plausible = (
-            plausible
-            and config.plausible_joints[0, i] <= position[i] <= config.plausible_joints[1, i]
-        )
-        plausible = plausible and abs(velocity[i]) <= config.max_joint_radps * config.per_rad[i]
+        is_slow = abs(velocity[i]) <= config.max_joint_radps * config.per_rad[i]
+        plausible = plausible and is_slow and low[i] <= position[i] <= high[i]
         deviation = max(deviation, abs(position[i] - state.measured[i]) / config.per_rad[i])
         moved = max(moved, abs(position[i] - state.arm_still_posture[i]) / config.per_rad[i])
     return plausible, deviation, moved
 
 
 @compiled
-def unwrap(states: Records, parameters: Records, position: Vector) -> None:
+def unwrap(state: Struct, config: Struct, position: Vector) -> None:
     """Shift continuous joints (J,) [rad] by whole turns to be nearest to the newest sample, in
     place. A driver that wraps at ±π and one that counts turns then give the same positions.
     """
     for i in range(len(position)):
-        if parameters[0].is_continuous[i] and math.isfinite(position[i]):
-            position[i] += TURN * np.rint((states[0].measured[i] - position[i]) / TURN)
+        if config.is_continuous[i] and math.isfinite(position[i]):
+            position[i] += TURN * np.rint((state.measured[i] - position[i]) / TURN)

@@ -16,9 +16,10 @@ published filter:
 * A hand enters a calmer mode only when it is slow (`_switched`), conditioned on being slow
   (`_calm_down`). On leaving the calm modes, its tremor becomes motion (`_leave_calm`).
 
-Arrays of one hand: `means` (MODES, STATES, 3) hold (p, v, a, y, w) of each mode, by axis [m, m/s,
-m/s², m, m/s]; `covariances` (MODES, STATES, STATES) are shared by the three axes; `modes` (MODES,)
-are the probabilities of the modes. All functions change them in place.
+Arrays of one hand: `mode_means` (MODES, STATES, 3) hold (p, v, a, y, w) of each mode, by axis [m,
+m/s, m/s², m, m/s]; `mode_covariances` (MODES, STATES, STATES) are shared by the three axes;
+`mode_probabilities` are (MODES,). `tremors` (1 + MODES,) are the rate ω of the tremor and its
+variance σ² in each mode. All functions change means and covariances in place.
 """
 
 from __future__ import annotations
@@ -27,62 +28,54 @@ import numpy as np
 
 from kmp.compiled import compiled
 from kmp.elementary import exp, log
-from thirdhand.core.frame import Records, Vector
+from thirdhand.core.frame import Struct, Vector
 from thirdhand.core.intake import MODES, STATES
 from thirdhand.core.intake.motion_model import CHANGE, ENDLESS, REACH, STEADY
-from thirdhand.core.vectors import square
+from thirdhand.core.vectors import dot, square
 
 
 @compiled
-def start(
-    parameters: Records,
-    means: Vector,
-    covariances: Vector,
-    modes: Vector,
-    noise: float,
-    position: Vector,
-    tremor: Vector,
-) -> None:
+def start(state: Struct, config: Struct, side: int, position: Vector) -> None:
     """Initial estimate from a single sample (3,) [m] with noise variance r [m²]: in each mode
 
         mean (position, 0, 0, 0, 0),   covariance diag(r, σ_v², q / (2 k_a), σ², (ω σ)²)
 
-    with σ_v = start_speed_std_mps, and the rate ω and the mode's σ² of the `tremor` (1 + MODES,).
-    The variance of the acceleration is the stationary one of the mode CHANGE. The probabilities are
-    mode_prior.
+    with σ_v = start_speed_std_mps, and the tremor's ω and σ². The variance of the acceleration is
+    the stationary one of the mode CHANGE. The probabilities are mode_prior.
     """
-    config = parameters[0]
-    of_acceleration = config.mode_intensities_m2ps5[CHANGE] / (
-        2.0 * config.mode_acceleration_reversions_per_s[CHANGE]
-    )
+    means = state.mode_means[side]
+    covariances = state.mode_covariances[side]
     means[:] = 0.0
     covariances[:] = 0.0
     for mode in range(MODES):
-        for axis in range(3):
-            means[mode, 0, axis] = position[axis]
-        covariances[mode, 0, 0] = noise
+        means[mode, 0] = position
+        covariances[mode, 0, 0] = state.noise_variance[side]
         covariances[mode, 1, 1] = config.start_speed_std_mps**2
-        covariances[mode, 2, 2] = of_acceleration
-        _tremble(means[mode], covariances[mode], tremor, mode)
-        modes[mode] = config.mode_prior[mode]
+        covariances[mode, 2, 2] = config.mode_intensities_m2ps5[CHANGE] / (
+            2.0 * config.mode_acceleration_reversions_per_s[CHANGE]
+        )
+        _tremble(means[mode], covariances[mode], state.tremors[side], mode)
+    state.mode_probabilities[side] = config.mode_prior
 
 
 @compiled
-def advance(means: Vector, covariances: Vector, overs: Records, rate: int, tremor: Vector) -> None:
-    """Prediction of all modes over an interval. `overs` (1,) is a record of `motion_model.model`,
-    `rate` the index of the tremor's rate, and `tremor` (1 + MODES,) has its variance in each mode.
+def advance(state: Struct, side: int, over: Struct) -> None:
+    """Prediction of all modes of a hand over the interval of a record of `motion_model.models`.
 
     With an evident tremor, REACH has the motion ENDLESS: otherwise the steady innovation of a hand
     whose velocity does not revert would count as a change, and a change follows the tremor.
     """
+    variances = state.tremors[side, 1:]
     for mode in range(MODES):
-        motion = ENDLESS if mode == REACH and tremor[1 + CHANGE] > 0.0 else mode
-        move_on(means[mode], covariances[mode], overs, motion, rate, tremor[1 + mode])
+        motion = ENDLESS if mode == REACH and variances[CHANGE] > 0.0 else mode
+        mean = state.mode_means[side, mode]
+        covariance = state.mode_covariances[side, mode]
+        move_on(mean, covariance, over, motion, state.tremor_rate[side], variances[mode])
 
 
 @compiled
-def move_on(  # noqa: C901, PLR0912 - one nest of loops
-    mean: Vector, covariance: Vector, overs: Records, motion: int, rate: int, tremor: float
+def move_on(
+    mean: Vector, covariance: Vector, over: Struct, motion: int, rate: int, tremor: float
 ) -> None:
     """Prediction of one filter: m = F m, P = F P Fᵀ + Q, in place.
 
@@ -90,46 +83,46 @@ def move_on(  # noqa: C901, PLR0912 - one nest of loops
     and a tremor block (2, 2), that of the `rate`. That of Q is multiplied by the variance `tremor`
     [m²].
     """
+    # the blocks of F, below each other: F is block-diagonal, motion and tremor
+    blocks = np.empty((STATES, 3))
+    blocks[:3] = over.transition[motion]
+    blocks[3:, :2] = over.tremor[rate]
     moved = np.empty((STATES, 3))
     product = np.empty((STATES, STATES))
-    over = np.empty((STATES, 3))
-    moves = overs[0].transition[motion]
-    trembles = overs[0].tremor[rate]
-    driving = overs[0].noise[motion]
-    trembling = overs[0].tremor_noise[rate]
-
-    # the blocks of F, below each other
     for row in range(STATES):
-        for k in range(3 if row < 3 else 2):
-            over[row, k] = moves[row, k] if row < 3 else trembles[row - 3, k]
-
-    # F m, and the product F P
-    for row in range(STATES):
-        first, count = (0, 3) if row < 3 else (3, 2)  # F is block-diagonal: motion and tremor
+        first, count = (0, 3) if row < 3 else (3, 2)
         for column in range(STATES):
             p = 0.0
             for k in range(count):
-                p += over[row, k] * covariance[first + k, column]
+                p += blocks[row, k] * covariance[first + k, column]
             product[row, column] = p
         for axis in range(3):
             m = 0.0
             for k in range(count):
-                m += over[row, k] * mean[first + k, axis]
+                m += blocks[row, k] * mean[first + k, axis]
             moved[row, axis] = m
     mean[:] = moved
 
     # F P Fᵀ + Q
+    covariance[:] = 0.0
+    covariance[:3, :3] = over.noise[motion]
     for row in range(STATES):
         for column in range(row, STATES):
-            p = 0.0
-            if column < 3:
-                p = driving[row, column]
-            elif row >= 3:
-                p = tremor * trembling[row - 3, column - 3]
+            p = covariance[row, column]
+            if row >= 3:
+                p = tremor * over.tremor_noise[rate, row - 3, column - 3]
             first, count = (0, 3) if column < 3 else (3, 2)
             for k in range(count):
-                p += product[row, first + k] * over[column, k]
+                p += product[row, first + k] * blocks[column, k]
             covariance[row, column] = covariance[column, row] = p
+
+
+@compiled
+def _mirror(covariance: Vector) -> None:
+    """Copy the upper triangle of a matrix to the lower one."""
+    for row in range(STATES):
+        for column in range(row):
+            covariance[row, column] = covariance[column, row]
 
 
 @compiled
@@ -171,12 +164,12 @@ def _tremble(mean: Vector, covariance: Vector, tremor: Vector, mode: int) -> Non
 
 
 @compiled
-def _calm_down(parameters: Records, mean: Vector, covariance: Vector, mode: int) -> None:
+def _calm_down(config: Struct, mean: Vector, covariance: Vector, mode: int) -> None:
     """Condition a faster mode on being as slow as a calm `mode`: a Kalman update by v = 0 with
     standard deviation σ_v = calm_speed_stds_mps, then by a = 0 with the same number in m/s²: the
     drift of a resting hand changes within a second.
     """
-    spread = parameters[0].calm_speed_stds_mps[mode]
+    spread = config.calm_speed_stds_mps[mode]
     for order in range(1, 3):
         row_of = covariance[order].copy()
         variance = row_of[order] + spread * spread
@@ -194,28 +187,23 @@ def _leave_calm(mean: Vector, covariance: Vector) -> None:
     """Turn the tremor of a calm mode into motion: p = p + y and v = v + w, in mean and
     covariance. The samples showed both, so the filter restarts from the unsmoothed state.
     """
-    for row in range(2):
-        for axis in range(3):
-            mean[row, axis] += mean[row + 3, axis]
-        for column in range(STATES):
-            covariance[row, column] += covariance[row + 3, column]
-    for column in range(2):
-        for row in range(3):
-            covariance[row, column] += covariance[row, column + 3]
+    mean[:2] += mean[3:]
+    covariance[:2] += covariance[3:]
+    covariance[:3, :2] += covariance[:3, 3:]
 
 
 @compiled
-def bounded(parameters: Records, innovation: float) -> float:
+def bounded(config: Struct, innovation: float) -> float:
     """Squared, normalised innovation x on three axes, limited to 6 outlier_variances, where exp(-½
     x) is least_mode_probability on each axis: a less probable sample does not distinguish modes.
     """
-    most: float = 6.0 * parameters[0].outlier_variances
+    most: float = 6.0 * config.outlier_variances
     return min(innovation, most)
 
 
 @compiled
 def _switched(
-    parameters: Records,
+    config: Struct,
     means: Vector,
     covariances: Vector,
     modes: Vector,
@@ -232,7 +220,6 @@ def _switched(
 
         slow_ij = exp(-½ bounded(|v_i|² / (P_i[v, v] + σ_j²))),   σ_j = calm_speed_stds_mps
     """
-    config = parameters[0]
     for i in range(MODES):
         stay = exp(-config.mode_switch_rates_per_s[i] * interval_s)
         for j in range(MODES):
@@ -241,14 +228,14 @@ def _switched(
             )
         for calm in range(min(i, REACH)):
             variance = covariances[i, 1, 1] + config.calm_speed_stds_mps[calm] ** 2
-            slow = exp(-0.5 * bounded(parameters, square(means[i, 1]) / variance))
+            slow = exp(-0.5 * bounded(config, square(means[i, 1]) / variance))
             shares[i, i] += (1.0 - slow) * shares[i, calm]
             shares[i, calm] *= slow
 
 
 @compiled
 def _mix(  # noqa: C901, PLR0912 - one nest of loops
-    parameters: Records,
+    config: Struct,
     means: Vector,
     covariances: Vector,
     shares: Vector,
@@ -274,104 +261,94 @@ def _mix(  # noqa: C901, PLR0912 - one nest of loops
             of_means[j, i] = means[i]
             of_covariances[j, i] = covariances[i]
             if j < min(i, REACH):
-                _calm_down(parameters, of_means[j, i], of_covariances[j, i], j)
+                _calm_down(config, of_means[j, i], of_covariances[j, i], j)
             if i != j and max(i, j) >= REACH and not is_evident:
                 if i <= STEADY:
                     _leave_calm(of_means[j, i], of_covariances[j, i])
                 _tremble(of_means[j, i], of_covariances[j, i], tremor, j)
 
     for j in range(MODES):
+        mean = means[j]
+        covariance = covariances[j]
         expected[j] = 0.0
-        mixed = means[j]
-        spread = covariances[j]
+        mean[:] = 0.0
+        covariance[:] = 0.0
         for i in range(MODES):
             expected[j] += shares[i, j]
-        mixed[:] = 0.0
-        spread[:] = 0.0
         for i in range(MODES):
-            share = shares[i, j] / expected[j]
             for a in range(STATES):
-                for b in range(3):
-                    mixed[a, b] += share * of_means[j, i, a, b]
+                for axis in range(3):
+                    mean[a, axis] += shares[i, j] / expected[j] * of_means[j, i, a, axis]
         for i in range(MODES):
-            share = shares[i, j] / expected[j]
-            mean = of_means[j, i]
+            deviations = of_means[j, i]
+            deviations -= mean
             for a in range(STATES):
                 for b in range(a, STATES):
-                    between = 0.0
-                    for k in range(3):
-                        between += (mean[a, k] - mixed[a, k]) * (mean[b, k] - mixed[b, k])
-                    spread[a, b] += share * (of_covariances[j, i, a, b] + between / 3.0)
+                    variance = of_covariances[j, i, a, b] + dot(deviations[a], deviations[b]) / 3.0
+                    covariance[a, b] += shares[i, j] / expected[j] * variance
 
 
 @compiled
-def _beyond_calm(parameters: Records, mean: Vector, tremor: Vector, mode: int) -> float:
+def _beyond_calm(config: Struct, mean: Vector, tremor: Vector, mode: int) -> float:
     """Squared, normalised excess of the speed and tremor of a calm mode over their bounds:
 
         max(|v|² / σ_v² - outlier_variances, 0) + max(|y|² + |w|² / ω² - y_max², 0) / σ²
 
     with σ_v = calm_speed_stds_mps, y_max = max_tremor_m and the tremor's σ.
     """
-    config = parameters[0]
     speed = square(mean[1]) / config.calm_speed_stds_mps[mode] ** 2
-    amplitude = 0.0
-    for axis in range(3):
-        amplitude += mean[3, axis] ** 2 + (mean[4, axis] / tremor[0]) ** 2
-    trembles: float = max(amplitude - config.max_tremor_m**2, 0.0) / float(tremor[1 + mode])
-    drifts: float = max(speed - config.outlier_variances, 0.0)
-    return drifts + trembles
+    beyond_m2 = max(amplitude(mean, tremor[0]) - config.max_tremor_m**2, 0.0)
+    return float(max(speed - config.outlier_variances, 0.0) + beyond_m2 / tremor[1 + mode])
 
 
 @compiled
-def update(
-    parameters: Records,
-    means: Vector,
-    covariances: Vector,
-    modes: Vector,
-    noise: float,
-    position: Vector,
-    interval_s: float,
-    tremor: Vector,
-) -> None:
+def amplitude(mean: Vector, rate: float) -> float:
+    """Squared amplitude |y|² + |w|² / ω² [m²] of the tremor in a mean (STATES, 3)."""
+    square_m2 = 0.0
+    for axis in range(3):
+        square_m2 += mean[3, axis] ** 2 + (mean[4, axis] / rate) ** 2
+    return square_m2
+
+
+@compiled
+def update(state: Struct, config: Struct, side: int, position: Vector, interval_s: float) -> None:
     """Posterior of all modes after a sample z (3,) [m] with noise variance r [m²], `interval_s`
     after the sample before. The modes must have been advanced to the time of the sample.
 
     Without an evident tremor, that of CHANGE is cleared first, as it may have been evident before.
-    The modes are mixed (`_switched`, `_mix`), then each is updated (`measure`), with the tremor of
-    rate ω and variances σ² in `tremor` (1 + MODES,):
+    The modes are mixed (`_switched`, `_mix`), then each is updated (`measure`):
 
         log L = -3/2 log S - ½ bounded(|z - H m|² / S),   μ_j ∝ c_j L_j
 
     The innovation in log L is that before the update. In the calm modes, log L is reduced by half
     of `_beyond_calm`. The probabilities μ stay above about least_mode_probability.
     """
+    means = state.mode_means[side]
+    covariances = state.mode_covariances[side]
+    modes = state.mode_probabilities[side]
+    tremor = state.tremors[side]
     shares = np.empty((MODES, MODES))
     expected = np.empty(MODES)
     likelihood = np.empty(MODES)
     if tremor[1 + CHANGE] == 0.0:
         _tremble(means[CHANGE], covariances[CHANGE], tremor, CHANGE)
-    _switched(parameters, means, covariances, modes, interval_s, shares)
-    _mix(parameters, means, covariances, shares, expected, tremor)
+    _switched(config, means, covariances, modes, interval_s, shares)
+    _mix(config, means, covariances, shares, expected, tremor)
 
-    best = -1e300
     for i in range(MODES):
-        mean = means[i]
-        p = covariances[i]
-        for row in range(STATES):
-            for column in range(row):
-                p[row, column] = p[column, row]
-        variance, error = measure(mean, p, noise, position)
-        likelihood[i] = -1.5 * log(variance) - 0.5 * bounded(parameters, error)
+        _mirror(covariances[i])
+        variance, error = measure(means[i], covariances[i], state.noise_variance[side], position)
+        likelihood[i] = -1.5 * log(variance) - 0.5 * bounded(config, error)
         if i <= STEADY:
-            likelihood[i] -= 0.5 * _beyond_calm(parameters, mean, tremor, i)
-        best = max(best, likelihood[i])
+            likelihood[i] -= 0.5 * _beyond_calm(config, means[i], tremor, i)
 
     # Relative to the best one, no likelihood underflows in all modes.
+    best = likelihood.max()
     for i in range(MODES):
         modes[i] = expected[i] * exp(likelihood[i] - best)
     _normalise(modes)
     for i in range(MODES):
-        modes[i] = max(modes[i], parameters[0].least_mode_probability)
+        modes[i] = max(modes[i], config.least_mode_probability)
     _normalise(modes)
 
 

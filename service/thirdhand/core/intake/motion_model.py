@@ -37,12 +37,11 @@ def models(period_s: float, count: int, numbers: IntakeTuning = TUNING.intake) -
     """Transition and process noise of all modes over 0 to `count` - 1 periods: record n holds the
     fields of `model` for n `period_s`.
     """
-    motions = [(name, np.float64, (MODES + 1, 3, 3)) for name in ("transition", "noise")]
-    tremors = [(name, np.float64, (TREMOR_RATES, 2, 2)) for name in ("tremor", "tremor_noise")]
-    out = structured(count, [*motions, *tremors])
     times_s: Vector = np.array([ticks * period_s for ticks in range(count)])
-    for name, values in model(times_s, numbers).items():
-        out[name] = values
+    fields = model(times_s, numbers)
+    out = structured(count, [(name, np.float64, array.shape[1:]) for name, array in fields.items()])
+    for name, array in fields.items():
+        out[name] = array
     return out
 
 

@@ -1,11 +1,12 @@
 """Intake of hand and arm samples: check them, map them to frame `base`, and filter them to a state
 at the tick. The clutch, the wish for the gripper and reports of hand guiding are taken in here too.
 
-`plausibility` states all rules by which samples are accepted; `late_samples` handles late ones.
+`step` states all rules by which samples are accepted; `retained_samples` filters late ones too.
 """
 
 from __future__ import annotations
 
+import contextlib
 import math
 from typing import NamedTuple, TypeAlias
 
@@ -24,14 +25,12 @@ from thirdhand.contract.messages import (
 from thirdhand.contract.records import SIDES, SOURCES, Cause
 from thirdhand.core.frame import Event, Record, as_array, parameters
 from thirdhand.core.geometry import rotation
-from thirdhand.core.intake.arm_samples import still_ticks
 from thirdhand.core.intake.hand_estimator import HandEstimator
 from thirdhand.core.intake.motion_model import models
 from thirdhand.core.intake.step import report, take_arm, take_hand
 from thirdhand.core.tuning import TUNING, Tuning
 from thirdhand.settings.config import HandSettings, Settings
 
-ARM = SOURCES.index("arm")
 UNIT_M = {"m": 1.0, "cm": 0.01, "mm": 0.001}  # length [m] of each `hands.unit`
 
 
@@ -82,21 +81,18 @@ class Intake:
     def __init__(self, settings: Settings, *, tuning: Tuning = TUNING) -> None:
         hands = settings.hands
         numbers = tuning.intake
-        self._stale_ticks = _stale_ticks("hands/left", settings)
-        self._silent_ticks = _stale_ticks("joints/state", settings)
-        self._still_ticks = still_ticks(settings, tuning)
         self._names = settings.joints.names
-        self._clutch_ticks, self._guided_ticks = (
-            _stale_ticks(key, settings) for key in ("clutch", "joints/guided")
-        )
+        # by kind of event: the tick until which it holds, and for how many ticks
+        self._holding = {
+            "clutch": ("clutch_until_tick", _stale_ticks("clutch", settings)),
+            "joints/guided": ("guided_until_tick", _stale_ticks("joints/guided", settings)),
+        }
 
         # The longest interval: between samples of a hand that reappears, and a late sample's age.
         longest_s = hands.longest_stale_ms / 1000
-        stale_max_ticks = max(self._stale_ticks, settings.ticks_in(longest_s))
-        unseen_ticks = max(
-            stale_max_ticks, math.ceil(settings.hands.unseen_ms / 1000 / settings.period_s)
-        )
-        self._unseen_ticks = unseen_ticks
+        stale_ticks = _stale_ticks("hands/left", settings)
+        stale_max_ticks = max(stale_ticks, settings.ticks_in(longest_s))
+        unseen_ticks = max(stale_max_ticks, math.ceil(hands.unseen_ms / 1000 / settings.period_s))
         longest_late_s = max(numbers.max_late_s, longest_s)
         late_ticks = math.ceil(longest_late_s / settings.period_s)
         self._models = models(settings.period_s, unseen_ticks + late_ticks + 1, numbers)
@@ -106,12 +102,13 @@ class Intake:
         per_rad = np.array(joints.per_rad)
         self.parameters = parameters(
             period_s=settings.period_s,
-            stale_ticks=self._stale_ticks,
+            stale_ticks=stale_ticks,
             stale_max_ticks=stale_max_ticks,
             longest_late_s=longest_late_s,
             unseen_ticks=unseen_ticks,
-            silent_ticks=self._silent_ticks,
-            still_ticks=self._still_ticks,
+            silent_ticks=_stale_ticks("joints/state", settings),
+            # for so long an arm must report one posture before it is accepted as at rest
+            still_ticks=settings.ticks_in(numbers.max_late_s),
             joint_jump_speed=float((np.array(joints.velocity) / per_rad).max()),
             plausible_joints=limits + numbers.max_outside_rad * per_rad * np.array([[-1.0], [1.0]]),
             per_rad=per_rad,
@@ -128,7 +125,8 @@ class Intake:
             jump_noise_stds=2.0 * numbers.outlier_stds,  # twice, as the prediction is uncertain too
             arm_still_rad=numbers.arm_still_rad,
             confirmed_s=numbers.confirmed_s,
-            delay_tolerance_s=numbers.delay_tolerance_s,
+            # 1 %, the largest drift between two clocks
+            delay_tolerance_s=0.01 * numbers.tracker_memory_s,
             contested_off_share=numbers.contested_off_share,
             max_joint_radps=numbers.max_joint_radps,
             is_continuous=np.array([int(kind == "continuous") for kind in joints.every_kind]),
@@ -149,11 +147,10 @@ class Intake:
 
     def begin(self, state: Record) -> None:
         """Set the values that hold before the first sample, in a state of zeros."""
-        for field in ("tick", "hand_ticks", "clock_tick", "memory_ticks"):
+        of_hands = ("hand_ticks", "clock_tick", "memory_ticks")
+        for field in ("tick", *of_hands, "arm_tick", "arm_still_tick", "arm_sample_ticks"):
             state[field] = -1
-        for field in ("arm_tick", "arm_still_tick", "arm_sample_ticks"):
-            state[field] = -1
-        state["stale_ticks"] = self._stale_ticks
+        state["stale_ticks"] = self.parameters["stale_ticks"][0]
         self._estimator.begin(state)
 
     def step(self, state: Record, frame: Record, ticks: int, samples: list[Event]) -> int:
@@ -165,14 +162,9 @@ class Intake:
             match event.kind:
                 case "joints/state":
                     self.take_arm(state, event.value)
-                case "clutch":
-                    state["clutch_until_tick"] = (
-                        state["tick"] + self._clutch_ticks if event.value else 0
-                    )
-                case "joints/guided":
-                    state["guided_until_tick"] = (
-                        state["tick"] + self._guided_ticks if event.value else 0
-                    )
+                case "clutch" | "joints/guided":
+                    field, ticks = self._holding[event.kind]
+                    state[field] = state["tick"] + ticks if event.value else 0
                 case "gripper/wish":
                     state["gripper_wish"] = event.value
                 case _:
@@ -181,62 +173,52 @@ class Intake:
 
     def advance(self, state: Record, ticks: int) -> None:
         """Advance the state by some ticks: hands seen lately move on, others stand still."""
-        self._estimator.advance(state, ticks, self._unseen_ticks)
+        self._estimator.advance(state, ticks)
 
     def take_hand(self, state: Record, side: int, sample: PoseStamped) -> None:
         """Filter a sample of one hand, or count it as rejected."""
-        if (tracker := self._mappings.get(sample.frame_id)) is None:
-            state["rejected"][Cause.WRONG_FRAME] += 1
-            self._note(state, side, Cause.WRONG_FRAME, sample)
-            return
-        mapping, is_left_handed = tracker
-        if is_left_handed:
-            sample = z_reversed(sample)
-        cause = take_hand(
-            as_array(state),
-            self.parameters,
-            self._models,
-            side,
-            sample.stamp_ns,
-            sample.position,
-            sample.orientation,
-            mapping,
-        )
+        cause = int(Cause.WRONG_FRAME)
+        if tracker := self._mappings.get(sample.frame_id):
+            mapping, is_left_handed = tracker
+            if is_left_handed:
+                sample = z_reversed(sample)
+            cause = take_hand(
+                as_array(state),
+                self.parameters,
+                self._models,
+                side,
+                sample.stamp_ns,
+                sample.position,
+                sample.orientation,
+                mapping,
+            )
         if cause >= 0:
-            self._note(state, side, cause, sample)
+            newest_ns = int(state["hand_stamps_ns"][side])
+            self.reject(state, SIDES[side], Cause(cause), sample, newest_ns=newest_ns)
 
     def take_arm(self, state: Record, sample: JointState) -> None:
         """Store a sample of the arm in the state, or count it as rejected."""
-        try:
-            position, velocity = measured(sample, self._names)
-        except WireError:
-            state["rejected"][Cause.INCOMPLETE] += 1
-            self._note(state, ARM, Cause.INCOMPLETE, sample)
-            return
-        cause = take_arm(
-            as_array(state),
-            self.parameters,
-            sample.stamp_ns,
-            np.array(position),
-            np.array(velocity),
-        )
+        cause = int(Cause.INCOMPLETE)
+        with contextlib.suppress(WireError):
+            motion = map(np.array, measured(sample, self._names))
+            cause = take_arm(as_array(state), self.parameters, sample.stamp_ns, *motion)
         if cause >= 0:
-            self._note(state, ARM, cause, sample)
+            newest_ns = int(state["arm_stamp_ns"])
+            joints = tuple(state["measured"].tolist())
+            self.reject(state, "arm", Cause(cause), sample, newest_ns=newest_ns, joints=joints)
 
     def reject(
-        self, state: Record, source: str, cause: Cause, sample: Sample, *, newest_ns: int
+        self,
+        state: Record,
+        source: str,
+        cause: Cause,
+        sample: Sample,
+        *,
+        newest_ns: int,
+        joints: tuple[float, ...] = (),
     ) -> None:
-        """Count a sample that another stage rejects, and retain it for reports."""
-        state["rejected"][cause] += 1
-        self.refused[source, cause] = Refused(cause, sample, newest_ns)
-        self.rejected[SOURCES.index(source), cause] += 1
-
-    def _note(self, state: Record, source: int, cause: int, sample: Sample) -> None:
         """Count a rejected sample, and retain it for reports."""
-        newest_ns = int(state["arm_stamp_ns"] if source == ARM else state["hand_stamps_ns"][source])
-        joints = tuple(state["measured"].tolist()) if source == ARM else ()
-        self.refused[SOURCES[source], Cause(cause)] = Refused(
-            Cause(cause), sample, newest_ns, joints
-        )
+        state["rejected"][cause] += 1
+        self.refused[source, cause] = Refused(cause, sample, newest_ns, joints)
         # last, so that another thread that sees the count finds `refused`
-        self.rejected[source, cause] += 1
+        self.rejected[SOURCES.index(source), cause] += 1

@@ -1,4 +1,17 @@
-"""Compiled step of the intake: check samples, compare them with earlier ones, and filter them."""
+"""Compiled step of the intake: check samples, compare them with earlier ones, and filter them. The
+rules by which samples are accepted are the same for both hands and for the arm:
+
+* A stamp differs from the newest one. It is at most `longest_late_s` older (the arm's stamps must
+  increase), and ahead by at most the time since the newest sample arrived plus the time after which
+  the source is silent. Silence is judged by arrival; after a silence, any stamp but the newest one
+  is accepted.
+* A sample has jumped if the hand or arm cannot have moved there since its newest sample. A hand's
+  jump is accepted once CONFIRMED_SAMPLES successive samples, over at least confirmed_s, agree with
+  each other. A jump of the arm is accepted only after a silence, because an arm cannot jump.
+* The arm is contested when more than contested_on_share of its states within about
+  tracker_memory_s jumped, until the share is below contested_off_share: two drivers report it. Of
+  two trackers of one hand, the daemon takes the samples of one only.
+"""
 
 from __future__ import annotations
 
@@ -26,33 +39,30 @@ from thirdhand.core.codes import (
     TWO_SOURCES,
     UNSEEN,
 )
-from thirdhand.core.frame import Records, Vector
-from thirdhand.core.geometry import ROUND_TO
-from thirdhand.core.intake import CONFIRMED_SAMPLES, KEPT
+from thirdhand.core.frame import Records, Struct, Vector
+from thirdhand.core.geometry import rounded
+from thirdhand.core.intake import CONFIRMED_SAMPLES, KEPT, SETTLED_SAMPLES
 from thirdhand.core.intake.arm_samples import compared, unwrap
 from thirdhand.core.intake.hand_estimator import (
+    estimate,
     goes_on,
+    is_fresh,
     note_clock,
-    order_of,
-    take,
+    slot,
     ticks_late,
     turn_to,
 )
-from thirdhand.core.intake.late_samples import drop, expected, take_late, tick_made, wrong_samples
-from thirdhand.core.intake.plausibility import is_confirmed
-from thirdhand.core.vectors import distance, squared_distance
-
-
-@compiled
-def is_contested(states: Records, parameters: Records) -> bool:
-    """True if two sources report the arm: its share of contradicting states is above
-    contested_on_share, or above contested_off_share if it was contested at the last tick.
-    """
-    state = states[0]
-    config = parameters[0]
-    was_contested = state.reason == TWO_SOURCES
-    limit = config.contested_off_share if was_contested else config.contested_on_share
-    return bool(state.arm_contested > limit)
+from thirdhand.core.intake.retained_samples import (
+    drop,
+    expected,
+    order_of,
+    take,
+    take_late,
+    tick_made,
+    wrong_samples,
+)
+from thirdhand.core.intake.tremor import note_tremor
+from thirdhand.core.vectors import distance, square, squared_distance, transform
 
 
 @compiled
@@ -77,7 +87,7 @@ def refusal(
 
 
 @compiled
-def note_arm(states: Records, parameters: Records, jumped: bool) -> None:
+def note_arm(state: Struct, config: Struct, jumped: bool) -> None:
     """Update the share c of the arm's recent states that contradict the others:
 
         c = c + (1 - exp(-Δ / tracker_memory_s)) (jumped - c)
@@ -87,8 +97,6 @@ def note_arm(states: Records, parameters: Records, jumped: bool) -> None:
     the time after which the arm is silent. So the states of two drivers that take turns have the
     same weight, however soon one follows the other.
     """
-    state = states[0]
-    config = parameters[0]
     ticks = state.arm_sample_ticks
     passed = float(state.tick - ticks[0])
     if ticks[1] < state.tick:
@@ -98,32 +106,7 @@ def note_arm(states: Records, parameters: Records, jumped: bool) -> None:
     passed_s = min(passed * config.period_s, config.silent_ticks * config.period_s)
     share = state.arm_contested
     share += (1.0 - exp(-passed_s / config.tracker_memory_s)) * ((1.0 if jumped else 0.0) - share)
-    state.arm_contested = np.rint(share * ROUND_TO) / ROUND_TO if share > 1e-6 else 0.0
-
-
-@compiled
-def has_jumped(
-    states: Records,
-    parameters: Records,
-    side: int,
-    position: Vector,
-    expected: Vector,
-    interval_s: float,
-) -> bool:
-    """True if a sample x (3,) [m] of a fresh hand is farther from the `expected` position p (3,)
-    than a hand can move and a tracker's noise explains:
-
-        |x - p| > max(jump + jump_speed * interval, jump_noise_stds * noise standard deviation)
-
-    `interval_s` is the time since the sample from which p was predicted.
-    """
-    state = states[0]
-    config = parameters[0]
-    gate = max(
-        config.jump_m + config.jump_speed_mps * interval_s,
-        config.jump_noise_stds * math.sqrt(state.noise_variance[side]),
-    )
-    return bool(squared_distance(position, expected) > gate * gate)
+    state.arm_contested = rounded(share) if share > 1e-6 else 0.0
 
 
 @compiled
@@ -142,10 +125,9 @@ def take_arm(
         # Before it is ready, and after a silence, an arm is in the turn that it reports, because it
         # may have restarted. While it is commanded, its turns are counted on.
         if fresh or (state.arm_ready and state.mode != FAULT):
-            unwrap(states, parameters, position)
-        cause = _judge_arm(states, parameters, stamp_ns, position, velocity, fresh)
+            unwrap(state, config, position)
+        cause = _judge_arm(state, config, stamp_ns, position, velocity, fresh)
     if cause >= 0:
-        state.rejected[cause] += 1
         return cause
     state.measured[:] = position
     state.measured_velocities[:] = velocity
@@ -156,8 +138,8 @@ def take_arm(
 
 @compiled
 def _judge_arm(
-    states: Records,
-    parameters: Records,
+    state: Struct,
+    config: Struct,
     stamp_ns: int,
     position: Vector,
     velocity: Vector,
@@ -166,9 +148,7 @@ def _judge_arm(
     """Cause for which a finite sample of the arm is rejected, or -1. Notes whether it contradicts
     the others, and whether the arm is still.
     """
-    state = states[0]
-    config = parameters[0]
-    plausible, deviation, moved = compared(states, parameters, position, velocity)
+    plausible, deviation, moved = compared(state, config, position, velocity)
     if not plausible:
         return OUT_OF_RANGE
 
@@ -177,7 +157,7 @@ def _judge_arm(
     cause = refusal(stamp_ns, state.arm_stamp_ns, fresh, passed_s, silent_s, 0.0)
     if cause != REPEATED:
         jumped = fresh and deviation > config.joint_jump_rad + config.joint_jump_speed * passed_s
-        note_arm(states, parameters, jumped)
+        note_arm(state, config, jumped)
         if jumped and cause < 0:
             cause = JUMPED
 
@@ -189,7 +169,7 @@ def _judge_arm(
 
 @compiled
 def _malformed(
-    parameters: Records,
+    config: Struct,
     position: tuple[float, float, float],
     turn: tuple[float, float, float, float],
     in_base: Vector,
@@ -197,22 +177,18 @@ def _malformed(
     """Cause for which the pose itself is rejected: NOT_FINITE, NOT_A_ROTATION, OUT_OF_RANGE; -1 if
     it is accepted. `in_base` (3,) [m] is the position in frame base.
     """
-    square = square_m2 = 0.0
-    for k in range(4):
-        square += turn[k] * turn[k]
-    for i in range(3):
-        square_m2 += in_base[i] * in_base[i]
-    if not (np.isfinite(np.array(position)).all() and np.isfinite(np.array(turn)).all()):
+    x, y, z, w = turn
+    if not np.isfinite(np.array(position + turn)).all():
         return NOT_FINITE
-    if not abs(math.sqrt(square) - 1.0) <= 0.01:
+    if not abs(math.sqrt(x * x + y * y + z * z + w * w) - 1.0) <= 0.01:
         return NOT_A_ROTATION
-    most_m = parameters[0].max_hand_distance_m
-    return -1 if square_m2 <= most_m * most_m else OUT_OF_RANGE
+    most_m = config.max_hand_distance_m
+    return -1 if square(in_base) <= most_m * most_m else OUT_OF_RANGE
 
 
 @compiled
 def _in_time(
-    states: Records, parameters: Records, side: int, stamp_ns: int, in_base: Vector, fresh: bool
+    state: Struct, config: Struct, side: int, stamp_ns: int, in_base: Vector, fresh: bool
 ) -> tuple[int, int, int]:
     """Cause for which a sample of a hand is rejected by its stamp, or -1; its `order` among the
     retained samples; and the tick in which it was made.
@@ -220,8 +196,6 @@ def _in_time(
     The retained samples are forgotten if a hand that is not `fresh` does not continue its filter at
     `in_base` (3,) [m], or its clock was set back.
     """
-    state = states[0]
-    config = parameters[0]
     order = 0
     newest_ns = state.hand_stamps_ns[side]
     period_s = config.period_s
@@ -231,41 +205,23 @@ def _in_time(
     if cause >= 0:
         return cause, 0, state.tick
 
-    if not fresh and (stamp_ns < newest_ns or not goes_on(states, parameters, side, in_base)):
+    if not fresh and (stamp_ns < newest_ns or not goes_on(state, config, side, in_base)):
         state.kept[side] = 0
     elif fresh and stamp_ns < newest_ns:
-        order = order_of(states, side, stamp_ns)
+        order = order_of(state, side, stamp_ns)
 
-    late = ticks_late(states, side, stamp_ns, period_s, config.longest_late_s)
+    late = ticks_late(state, side, stamp_ns, period_s, config.longest_late_s)
     if order >= KEPT - 1:
         return OLDER, 0, state.tick
     if order < 0:
         return REPEATED, order, state.tick
-    made_tick = (
-        tick_made(states, side, stamp_ns, order, late, period_s)
-        if order > 0 or late > 0
-        else state.tick
-    )
-    return -1, order, made_tick
-
-
-@compiled
-def _in_base(position: tuple[float, float, float], mapping: Vector) -> Vector:
-    """Position (3,) [m] in frame base of a tracker's position, by its axes times its unit, and its
-    origin: `mapping` (3, 4).
-    """
-    in_base = np.empty(3)
-    for i in range(3):
-        in_base[i] = mapping[i, 3]
-        for k in range(3):
-            in_base[i] += mapping[i, k] * position[k]
-    return in_base
+    return -1, order, tick_made(state, side, stamp_ns, order, late, period_s)
 
 
 @compiled
 def _jump(
-    states: Records,
-    parameters: Records,
+    state: Struct,
+    config: Struct,
     models: Records,
     side: int,
     order: int,
@@ -275,32 +231,56 @@ def _jump(
 ) -> tuple[bool, int]:
     """True if a hand's sample has jumped, and the number of wrong samples before it.
 
-    The sample at `position` (3,) [m] was made in tick `made`, and has number `order` among the
-    retained ones. If it continues these without the newest few, those were wrong (`wrong_samples`),
+    A sample x (3,) [m] of a `fresh` hand, made in tick `made` and number `order` of the retained
+    ones, is a jump if it is farther from the expected position p (3,) than a hand can move and a
+    tracker's noise explains, in the interval since the sample from which p was predicted:
+
+        |x - p| > max(jump + jump_speed * interval, jump_noise_stds * noise standard deviation)
+
+    If it continues the retained samples without the newest few, those were wrong (`wrong_samples`),
     and it has not jumped.
     """
-    state = states[0]
-    config = parameters[0]
-    jumped = False
-    wrong = 0
-    if fresh:
-        # predicted from the sample before it, by stamp
-        prediction = state.hands[side, 0].copy()
-        if order > 0 or made != state.tick:
-            expected(states, models, side, order, made, prediction)
-        neighbour = (state.kept_newest[side] - min(order, state.kept[side] - 1)) % KEPT
-        interval_s = abs(made - state.kept_ticks[side, neighbour]) * config.period_s
-        jumped = has_jumped(states, parameters, side, position, prediction, interval_s)
-        if jumped and order == 0:
-            wrong = wrong_samples(states, parameters, models, side, made, position)
-            jumped = wrong == 0
-    return jumped, wrong
+    if not fresh:
+        return False, 0
+    # predicted from the sample before it, by stamp
+    prediction = expected(state, models, side, order, made)
+    neighbour = slot(state, side, min(order, state.kept[side] - 1))
+    interval_s = abs(made - state.kept_ticks[side, neighbour]) * config.period_s
+    gate_m = max(
+        config.jump_m + config.jump_speed_mps * interval_s,
+        config.jump_noise_stds * math.sqrt(state.noise_variance[side]),
+    )
+    if squared_distance(position, prediction) <= gate_m * gate_m:
+        return False, 0
+    wrong = wrong_samples(state, config, models, side, made, position) if order == 0 else 0
+    return wrong == 0, wrong
+
+
+@compiled
+def _is_confirmed(state: Struct, config: Struct, side: int, position: Vector) -> bool:
+    """True if the jump of a hand to a position (3,) [m] is accepted; counts successive samples that
+    agree. Accepted are at least CONFIRMED_SAMPLES samples that agree over confirmed_s.
+
+    A sample agrees with the newest one that jumped if it is less than `stale_ticks` later and
+    within jump + jump_speed * elapsed time.
+    """
+    passed = state.tick - state.jump_newest_tick[side]
+    near_m = config.jump_m + config.jump_speed_mps * passed * config.period_s
+    is_near = distance(position, state.jumped_to[side]) <= near_m
+    if state.jump_count[side] == 0 or passed >= config.stale_ticks or not is_near:
+        state.jump_first_tick[side] = state.tick
+        state.jump_count[side] = 0
+    state.jumped_to[side] = position
+    state.jump_newest_tick[side] = state.tick
+    state.jump_count[side] += 1
+    agree_s = (state.tick - state.jump_first_tick[side] + 0.5) * config.period_s
+    return bool(state.jump_count[side] >= CONFIRMED_SAMPLES and agree_s >= config.confirmed_s)
 
 
 @compiled
 def _judge_hand(
-    states: Records,
-    parameters: Records,
+    state: Struct,
+    config: Struct,
     models: Records,
     side: int,
     stamp_ns: int,
@@ -310,13 +290,13 @@ def _judge_hand(
     """Cause for which a hand's well-formed sample (3,) [m] is rejected, or -1; its order and tick,
     as of `_in_time`; and the result of `_jump`.
     """
-    cause, order, made = _in_time(states, parameters, side, stamp_ns, position, fresh)
+    cause, order, made_tick = _in_time(state, config, side, stamp_ns, position, fresh)
     if cause >= 0:
-        return cause, order, made, False, 0
-    jumped, wrong = _jump(states, parameters, models, side, order, made, position, fresh)
-    if jumped and (order > 0 or not is_confirmed(states, parameters, side, position)):
+        return cause, order, made_tick, False, 0
+    jumped, wrong = _jump(state, config, models, side, order, made_tick, position, fresh)
+    if jumped and (order > 0 or not _is_confirmed(state, config, side, position)):
         cause = JUMPED
-    return cause, order, made, jumped, wrong
+    return cause, order, made_tick, jumped, wrong
 
 
 @compiled
@@ -337,63 +317,58 @@ def take_hand(
     `mapping` (3, 4) maps them to frame base: axes times unit [m], and origin.
     """
     state = states[0]
-    in_base = _in_base(position, mapping)
-    fresh = (
-        state.hand_ticks[side] >= 0
-        and state.tick - state.hand_ticks[side] < state.stale_ticks[side]
-    )
+    config = parameters[0]
+    in_base = np.empty(3)
+    transform(mapping[:, :3], mapping[:, 3], position, in_base)
+    fresh = is_fresh(state, side, state.stale_ticks[side])
 
     # Is the sample accepted?
     order = 0
     made_tick = state.tick
     jumped = False
     wrong = 0
-    cause = _malformed(parameters, position, turn, in_base)
+    cause = _malformed(config, position, turn, in_base)
     if cause < 0:
         cause, order, made_tick, jumped, wrong = _judge_hand(
-            states, parameters, models, side, stamp_ns, in_base, fresh
+            state, config, models, side, stamp_ns, in_base, fresh
         )
     if cause >= 0:
-        state.rejected[cause] += 1
         return cause
 
     # It is filtered after the samples made before it, without the wrong ones.
     before = state.hands[side, 0].copy()
     if wrong > 0:
-        drop(states, side, wrong)
+        drop(state, side, wrong)
+    note_clock(state, config, side, stamp_ns, fresh)
     if order == 0 and made_tick == state.tick and wrong == 0:
-        take(states, parameters, models, side, stamp_ns, in_base, jumped, fresh)
+        take(state, config, side, stamp_ns, in_base, jumped)
     else:
-        note_clock(states, parameters, side, stamp_ns, fresh)
-        take_late(states, parameters, models, side, stamp_ns, made_tick, in_base, jumped)
+        take_late(state, config, models, side, stamp_ns, made_tick, in_base, jumped)
+    if state.kept[side] > SETTLED_SAMPLES:
+        note_tremor(state, config, models, side, slot(state, side, SETTLED_SAMPLES))
+    estimate(state, config, models, side)
 
     # The newest sample is what later ones are compared with.
     if order == 0:
-        _note_correction(states, parameters, side, wrong, before)
+        _note_correction(state, config, side, wrong, before)
         state.jump_count[side] = 0
-        turn_to(states, side, turn, mapping)
+        turn_to(state, side, turn, mapping)
         state.hand_stamps_ns[side] = stamp_ns
         state.hand_ticks[side] = state.tick
     return -1
 
 
 @compiled
-def _note_correction(
-    states: Records, parameters: Records, side: int, wrong: int, before: Vector
-) -> None:
+def _note_correction(state: Struct, config: Struct, side: int, wrong: int, before: Vector) -> None:
     """Note how far a hand was moved when `wrong` samples were dropped, from the estimate `before`
     (3,) [m].
 
     Until the corrected estimate is confirmed like a jump, by CONFIRMED_SAMPLES further samples over
     confirmed_s, the hand may still be this far away: `hand_doubt_m`.
     """
-    state = states[0]
-    config = parameters[0]
     if wrong > 0:
         moved = distance(before, state.hands[side, 0])
-        state.hand_doubt_m[side] = max(
-            state.hand_doubt_m[side], np.rint(moved * ROUND_TO) / ROUND_TO
-        )
+        state.hand_doubt_m[side] = max(state.hand_doubt_m[side], rounded(moved))
         state.corrected_tick[side] = state.tick
         state.doubted_samples[side] = CONFIRMED_SAMPLES
     elif state.doubted_samples[side] > 0:
@@ -420,21 +395,21 @@ def report(states: Records, frames: Records, parameters: Records) -> int:
     for side in range(2):
         sample_tick = state.hand_ticks[side]
         frame.hand_ages[side] = -1 if sample_tick < 0 else state.tick - sample_tick
-        frame.stale_ticks[side] = state.stale_ticks[side]
-        frame.hands[side] = state.hands[side, 0]
-        frame.hand_velocities[side] = state.hands[side, 1]
+    frame.stale_ticks[:] = state.stale_ticks
+    frame.hands[:] = state.hands[:, 0]
+    frame.hand_velocities[:] = state.hands[:, 1]
     frame.tick = state.tick
     frame.rejected[:] = state.rejected
-    return _hand_conditions(frames, parameters) | _arm_conditions(states, parameters)
+    return _hand_conditions(frame, parameters[0]) | _arm_conditions(state, parameters[0])
 
 
 @compiled
-def _hand_conditions(frames: Records, parameters: Records) -> int:
+def _hand_conditions(frame: Struct, config: Struct) -> int:
     """HANDS_KNOWN, LEFT_UNSEEN and RIGHT_UNSEEN, as they hold for the ages in the frame."""
-    ages = frames[0].hand_ages
-    stale = frames[0].stale_ticks
+    ages = frame.hand_ages
+    stale = frame.stale_ticks
     is_any_seen = ages[0] < stale[0] or ages[1] < stale[1]
-    if ages.min() < 0 or ages.max() >= parameters[0].unseen_ticks or not is_any_seen:
+    if ages.min() < 0 or ages.max() >= config.unseen_ticks or not is_any_seen:
         return 0
     conditions = HANDS_KNOWN
     for side in range(2):
@@ -444,10 +419,12 @@ def _hand_conditions(frames: Records, parameters: Records) -> int:
 
 
 @compiled
-def _arm_conditions(states: Records, parameters: Records) -> int:
-    """ARM_HEARD, ARM_STILL, ARM_GUIDED, CONTESTED and CLUTCH_RELEASED, as they hold now."""
-    state = states[0]
-    config = parameters[0]
+def _arm_conditions(state: Struct, config: Struct) -> int:
+    """ARM_HEARD, ARM_STILL, ARM_GUIDED, CONTESTED and CLUTCH_RELEASED, as they hold now.
+
+    The arm is CONTESTED if its share of contradicting states is above contested_on_share, or above
+    contested_off_share if it was contested at the last tick.
+    """
     conditions = 0
     if state.arm_tick >= 0 and state.tick - state.arm_tick < config.silent_ticks:
         conditions |= ARM_HEARD
@@ -457,4 +434,6 @@ def _arm_conditions(states: Records, parameters: Records) -> int:
             conditions |= ARM_GUIDED
     if config.has_clutch and state.tick >= state.clutch_until_tick:
         conditions |= CLUTCH_RELEASED
-    return conditions | CONTESTED if is_contested(states, parameters) else conditions
+    was_contested = state.reason == TWO_SOURCES
+    limit = config.contested_off_share if was_contested else config.contested_on_share
+    return conditions | CONTESTED if state.arm_contested > limit else conditions

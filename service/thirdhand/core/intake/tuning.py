@@ -115,11 +115,6 @@ class IntakeTuning(NamedTuple):
         return self.outlier_stds * math.sqrt(self.mode_intensities_m2ps5[-1] / (2.0 * reversion))
 
     @property
-    def noise_std_m(self) -> float:
-        """Noise of each axis before it is estimated."""
-        return self.outlier_stds * self.least_noise_m
-
-    @property
     def hand_still_s(self) -> float:
         """A slow hand counts as still after two periods of tremor."""
         return 2.0 * self.stillness_lowpass_s
@@ -128,11 +123,6 @@ class IntakeTuning(NamedTuple):
     def confirmed_s(self) -> float:
         """Samples that confirm a jump span at least this time: a hand is not yet stale then."""
         return 0.5 * self.max_late_s
-
-    @property
-    def delay_tolerance_s(self) -> float:
-        """Minimum delays of two windows agree within 1 %, the largest drift between two clocks."""
-        return 0.01 * self.tracker_memory_s
 
     @property
     def arm_still_rad(self) -> float:

@@ -8,8 +8,8 @@ import numpy as np
 
 from kmp.compiled import compiled
 from thirdhand.core.codes import FAULT
-from thirdhand.core.frame import Records, Vector
-from thirdhand.core.geometry import ROUND_TO, quaternion_of
+from thirdhand.core.frame import Records, Struct, Vector
+from thirdhand.core.geometry import quaternion_of, rounded
 from thirdhand.core.kinematics import tool_speed_after
 from thirdhand.core.numerics import INSIDE_LIMIT_SHARE, LARGEST_USABLE, ROUNDING, STOP_SAMPLES
 from thirdhand.core.stops import braking_together, fastest_stop
@@ -31,16 +31,14 @@ def step(
     """
     if not is_usable(state):
         return UNUSABLE
-    met = _toward(state, velocity, parameters, wanted, moved)
+    met = _toward(state, velocity, parameters[0], wanted, moved)
     if not met & CHASED and not make_safe(state, moved, parameters):
         met |= UNSAFE
     return met
 
 
 @compiled
-def _toward(
-    state: Vector, velocity: Vector, parameters: Records, wanted: Vector, moved: Vector
-) -> int:
+def _toward(state: Vector, velocity: Vector, config: Struct, wanted: Vector, moved: Vector) -> int:
     """Move each joint one period toward its wanted velocity at constant jerk; return flags.
 
     With q, v, a of a joint, u its wanted velocity and r the ramp of u (wanted[1] on entry):
@@ -62,7 +60,6 @@ def _toward(
     A smooth input passes without lag: on a ramp, a' = a and v' = aim. A time-optimal profile that
     ends without acceleration would lag behind it by acceleration² / 2 jerk.
     """
-    config = parameters[0]
     met = 0
     stopping = False
     dt = config.period_s
@@ -175,7 +172,7 @@ def make_safe(state: Vector, moved: Vector, parameters: Records) -> bool:
     stop = np.empty(6)
     dt = config.period_s
     for i in range(moved.shape[1]):
-        moved[0, i] = np.rint(moved[0, i] * ROUND_TO) / ROUND_TO
+        moved[0, i] = rounded(moved[0, i])
         fastest_stop(
             moved[1, i], moved[2, i], config.max_acceleration[i], config.max_jerk[i], dt, stop
         )
@@ -186,7 +183,7 @@ def make_safe(state: Vector, moved: Vector, parameters: Records) -> bool:
             fastest_stop(
                 state[1, i], state[2, i], config.max_acceleration[i], config.max_jerk[i], dt, stop
             )
-            moved[0, i] = np.rint((state[0, i] + stop[2]) * ROUND_TO) / ROUND_TO
+            moved[0, i] = rounded(state[0, i] + stop[2])
             moved[1, i] = stop[0]
             moved[2, i] = stop[1]
     return safe
@@ -227,7 +224,7 @@ def speed_in_stop(dq: Vector, ddq: Vector, heres: Records, parameters: Records) 
             fastest_stop(dq[j], ddq[j], braking[j], config.max_jerk[j], time, stop)
             speed[j] = stop[0]
             displacement[j] = stop[2]
-        most = max(most, tool_speed_after(heres, displacement, speed))
+        most = max(most, tool_speed_after(heres[0], displacement, speed))
     return most
 
 

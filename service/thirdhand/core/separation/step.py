@@ -9,7 +9,7 @@ import numpy as np
 
 from kmp.compiled import compiled
 from kmp.elementary import exp
-from thirdhand.core.frame import Records, Vector
+from thirdhand.core.frame import Records, Struct, Vector
 from thirdhand.core.geometry import between_segments, carry_back, nearest_to_box, place, to_box
 from thirdhand.core.separation import FARTHEST_REPORTED_M
 from thirdhand.core.separation.clearance import ITSELF, PEOPLE, THINGS
@@ -18,9 +18,9 @@ from thirdhand.core.vectors import norm
 # figures of a step: nearest_m, speed_limit, setpoint_share
 NEAREST, SPEED_LIMIT, SETPOINT_SHARE = range(3)
 
-Scene: TypeAlias = tuple[Records, Records, Records, Records, Records, Records, Vector]
-"""States, heres, parameters, capsules, contacts and constraints of a step; and `near` (9,) [m], in
-which `geometry` writes the nearest points of two shapes and the unit normal between them.
+Scene: TypeAlias = tuple[Struct, Struct, Struct, Records, Records, Records, Vector]
+"""State, kinematics, parameters, capsules, contacts and constraints of a step; and `near` (9,) [m],
+in which `geometry` writes the nearest points of two shapes and the unit normal between them.
 """
 
 Approach: TypeAlias = tuple[bool, Vector, float, float, float, float]
@@ -87,10 +87,12 @@ def step(
 
     Only constraints that the joints can violate are kept.
     """
-    scene = (states, heres, parameters, capsules, contacts, constraints, np.empty(9))
+    state = states[0]
+    kinematics = heres[0]
     config = parameters[0]
+    scene = (state, kinematics, config, capsules, contacts, constraints, np.empty(9))
     placed = np.empty((2, len(capsules), 2, 3))  # ends of the capsules: now, and at a later time
-    place(heres[0].joints, config.frames, config.axes, capsules, placed[0])
+    place(kinematics.joints, config.frames, config.axes, capsules, placed[0])
     figures = np.empty(3)
     figures[NEAREST] = FARTHEST_REPORTED_M
     figures[SPEED_LIMIT] = _fastest(capsules)
@@ -98,7 +100,7 @@ def step(
 
     count = 0
     for side in range(2):
-        if states[0].hand_ticks[side] >= 0:
+        if state.hand_ticks[side] >= 0:
             count = _keep_from_hand(scene, side, count, placed, figures)
     count = _keep_from_boxes(scene, boxes, count, placed[0], figures)
     count = _keep_from_itself(scene, pairs, count, placed[0])
@@ -120,16 +122,13 @@ def _keep_from_hand(scene: Scene, side: int, count: int, placed: Vector, figures
 
     `placed` (2, C, 2, 3) [m] has the capsules' ends now, and is filled for a later time.
     """
-    states, heres, parameters, capsules, contacts, _, _ = scene
-    state = states[0]
-    config = parameters[0]
-    kinematics = heres[0]
+    state, kinematics, config, capsules, contacts, _, _ = scene
 
     # What is known of the hand: its velocity, and how much faster and nearer it may be.
-    is_known = _is_velocity_known(states, parameters, side)
+    is_known = _is_velocity_known(state, config, side)
     is_touched = _receives(contacts, state.hands, side, config.contact_margin_m)
     contact_speed = config.contact_speed if is_touched else 0.0
-    faster_by, nearer_by = _while_unseen(states, parameters, side)
+    faster_by, nearer_by = _while_unseen(state, config, side)
     moving = _swiftness(state.hands[side, 1], config.tremor_speed) if is_known else 0.0
 
     later = np.empty(len(kinematics.joints))
@@ -141,7 +140,7 @@ def _keep_from_hand(scene: Scene, side: int, count: int, placed: Vector, figures
             for j in range(len(later)):
                 later[j] = kinematics.joints[j] + ahead_s * state.joints[1, j]
             place(later, config.frames, config.axes, capsules, placed[1])
-        _move_hand(states, parameters, side, ahead_s, forearm, velocity)
+        _move_hand(state, config, side, ahead_s, forearm, velocity)
         braked = config.brake[PEOPLE] * max(ahead_s - config.brake_ramp_s, 0.0)
         approach = (is_known, velocity, faster_by, nearer_by, contact_speed, braked)
         parts = placed[1] if k > 0 else placed[0]
@@ -150,25 +149,22 @@ def _keep_from_hand(scene: Scene, side: int, count: int, placed: Vector, figures
 
 
 @compiled
-def _is_velocity_known(states: Records, parameters: Records, side: int) -> bool:
+def _is_velocity_known(state: Struct, config: Struct, side: int) -> bool:
     """True if a hand's velocity is certain enough, and the hand was not corrected lately."""
-    state = states[0]
     variance = 0.0
     for mode in range(state.mode_probabilities.shape[1]):
         variance += state.mode_probabilities[side, mode] * state.mode_covariances[side, mode, 1, 1]
-    limit = parameters[0].unknown_velocity_std_mps
+    limit = config.unknown_velocity_std_mps
     return bool(variance <= limit * limit and state.hand_doubt_m[side] == 0.0)
 
 
 @compiled
-def _while_unseen(states: Records, parameters: Records, side: int) -> tuple[float, float]:
+def _while_unseen(state: Struct, config: Struct, side: int) -> tuple[float, float]:
     """The speed [m/s] that an unseen hand may have gained, and the distance [m] it may be nearer.
 
     These are w and hand_doubt_m + w (t - w / 2g), with the hand's largest acceleration g, the time
     t unseen and w = g t, at most the unknown speed.
     """
-    state = states[0]
-    config = parameters[0]
     age_s = (state.tick - state.hand_ticks[side]) * config.period_s
     is_unseen = config.unseen_s[0] < age_s < config.unseen_s[1]
     unseen_s = age_s - config.unseen_s[0] if is_unseen else 0.0
@@ -179,16 +175,15 @@ def _while_unseen(states: Records, parameters: Records, side: int) -> tuple[floa
 
 @compiled
 def _move_hand(
-    states: Records,
-    parameters: Records,
+    state: Struct,
+    config: Struct,
     side: int,
     ahead_s: float,
     forearm: Vector,
     velocity: Vector,
 ) -> None:
     """Set the ends (2, 3) [m] of a hand's forearm, and its velocity (3,) [m/s], at a time ahead."""
-    config = parameters[0]
-    hand = states[0].hands[side]
+    hand = state.hands[side]
     accelerated_s = config.brake_ramp_s * (1.0 - exp(-ahead_s / config.brake_ramp_s))
     for i in range(3):
         speed = hand[1, i]
@@ -215,12 +210,11 @@ def _keep_parts(
     `parts` and `parts_now` (C, 2, 3) [m] have the capsules' ends at the time of the forearm (2, 3),
     and now.
     """
-    states, heres, parameters, capsules, _, constraints, near = scene
+    state, kinematics, config, capsules, _, constraints, near = scene
     is_known, velocity, faster_by, nearer_by, contact_speed, braked = approach
-    config = parameters[0]
     for capsule in range(config.first, len(capsules)):
         part = capsules[capsule]
-        is_tool = part.link == len(heres[0].joints)
+        is_tool = part.link == len(kinematics.joints)
         distance = between_segments(parts[capsule], forearm, near) - part.radius
         distance -= config.hand_radius
         if not is_later:
@@ -232,10 +226,10 @@ def _keep_parts(
         if is_known:
             coming = max(-_along(near, velocity), 0.0) + faster_by
         least = contact_speed if is_tool else 0.0
-        planned = _planned(parameters, PEOPLE, distance, coming, least, braked)
+        planned = _planned(config, PEOPLE, distance, coming, least, braked)
         if is_later and planned >= part.max_speed:
             continue
-        allowed = max(least, _allowed(parameters, PEOPLE, distance, coming))
+        allowed = max(least, _allowed(config, PEOPLE, distance, coming))
         if not is_later:
             figures[SPEED_LIMIT] = min(figures[SPEED_LIMIT], allowed)
         if planned >= part.max_speed:
@@ -246,9 +240,9 @@ def _keep_parts(
         constraint.allowed = allowed + braked + config.slip_speed_mps
         if is_later:
             carry_back(near, parts[capsule], parts_now[capsule])
-        _bring_together(constraints, count, near, 0, heres, part.link, 1.0)
+        _bring_together(constraints, count, near, 0, kinematics, part.link, 1.0)
         if is_tool:
-            share = _share(near, planned, states[0].setpoint[1])
+            share = _share(near, planned, state.setpoint[1])
             figures[SETPOINT_SHARE] = min(figures[SETPOINT_SHARE], share)
         count += _may_pass(constraints, count, planned, config.max_velocity)
     return count
@@ -261,8 +255,7 @@ def _keep_from_boxes(
     """Write the constraints of the boxes (B, ...), after the first `count`; return the number of
     all. `placed` (C, 2, 3) [m] has the capsules' ends.
     """
-    states, heres, parameters, capsules, _, constraints, near = scene
-    config = parameters[0]
+    state, kinematics, config, capsules, _, constraints, near = scene
     for capsule in range(config.first, len(capsules)):
         part = capsules[capsule]
         for box in range(len(boxes)):
@@ -271,15 +264,15 @@ def _keep_from_boxes(
             for point in range(3):
                 share = inner if point == 0 else point - 1.0
                 distance = to_box(placed[capsule], share, boxes[box], near) - part.radius
-                planned = _planned(parameters, THINGS, distance, 0.0, 0.0, 0.0)
+                planned = _planned(config, THINGS, distance, 0.0, 0.0, 0.0)
                 is_repeated = point > 0 and share == inner
                 if is_repeated or planned >= part.max_speed:
                     continue
-                _bring_together(constraints, count, near, 0, heres, part.link, 1.0)
-                planned = _limit(constraints, count, parameters, THINGS, distance, planned)
-                if part.link == len(heres[0].joints):
+                _bring_together(constraints, count, near, 0, kinematics, part.link, 1.0)
+                planned = _limit(constraints, count, config, THINGS, distance, planned)
+                if part.link == len(kinematics.joints):
                     figures[SETPOINT_SHARE] = min(
-                        figures[SETPOINT_SHARE], _share(near, planned, states[0].setpoint[1])
+                        figures[SETPOINT_SHARE], _share(near, planned, state.setpoint[1])
                     )
                 count += _may_pass(constraints, count, planned, config.max_velocity)
     return count
@@ -290,18 +283,18 @@ def _keep_from_itself(scene: Scene, pairs: Vector, count: int, placed: Vector) -
     """Write the constraints of pairs (P, 2) of parts, after the first `count`; return the number of
     all. `placed` (C, 2, 3) [m] has the capsules' ends.
     """
-    _, heres, parameters, capsules, _, constraints, near = scene
+    _, kinematics, config, capsules, _, constraints, near = scene
     for pair in range(len(pairs)):
         first = capsules[pairs[pair, 0]]
         second = capsules[pairs[pair, 1]]
         distance = between_segments(placed[pairs[pair, 0]], placed[pairs[pair, 1]], near)
         distance = distance - first.radius - second.radius
-        planned = _planned(parameters, ITSELF, distance, 0.0, 0.0, 0.0)
+        planned = _planned(config, ITSELF, distance, 0.0, 0.0, 0.0)
         if planned < first.max_speed + second.max_speed:
-            _bring_together(constraints, count, near, 0, heres, first.link, 1.0)
-            _bring_together(constraints, count, near, 3, heres, second.link, -1.0)
-            planned = _limit(constraints, count, parameters, ITSELF, distance, planned)
-            count += _may_pass(constraints, count, planned, parameters[0].max_velocity)
+            _bring_together(constraints, count, near, 0, kinematics, first.link, 1.0)
+            _bring_together(constraints, count, near, 3, kinematics, second.link, -1.0)
+            planned = _limit(constraints, count, config, ITSELF, distance, planned)
+            count += _may_pass(constraints, count, planned, config.max_velocity)
     return count
 
 
@@ -313,9 +306,8 @@ def _along(near: Vector, velocity: Vector) -> float:
 
 
 @compiled
-def _allowed(parameters: Records, rule: int, distance: float, coming: float) -> float:
+def _allowed(config: Struct, rule: int, distance: float, coming: float) -> float:
     """Speed [m/s] that the rule (PEOPLE, THINGS or ITSELF) allows at this distance [m]."""
-    config = parameters[0]
     return allowed_speed(
         distance, coming, config.brake[rule], config.reaction_s[rule], config.clearance[rule]
     )
@@ -323,7 +315,7 @@ def _allowed(parameters: Records, rule: int, distance: float, coming: float) -> 
 
 @compiled
 def _planned(
-    parameters: Records, rule: int, distance: float, coming: float, least: float, braked: float
+    config: Struct, rule: int, distance: float, coming: float, least: float, braked: float
 ) -> float:
     """Speed [m/s] that motion is planned with: lower than what the rule allows.
 
@@ -331,7 +323,6 @@ def _planned(
 
     with the planned brake and reaction time, and with the planned margin added to the clearance.
     """
-    config = parameters[0]
     brake = config.planned_brake[rule]
     reaction_s = config.planned_reaction_s[rule]
     planned = allowed_speed(
@@ -343,7 +334,7 @@ def _planned(
 
 @compiled
 def _limit(
-    constraints: Records, k: int, parameters: Records, rule: int, distance: float, planned: float
+    constraints: Records, k: int, config: Struct, rule: int, distance: float, planned: float
 ) -> float:
     """Set the limits of constraint k to a thing or another part; return the planned speed [m/s].
 
@@ -354,11 +345,10 @@ def _limit(
     Inside of the clearance `planned` is negative: the parts return. It is 0 if the joints cannot
     move them at retreat_authority_mps.
     """
-    config = parameters[0]
     constraint = constraints[k]
     left = distance - config.clearance[rule]
     slip = min(max(1.0 + left / config.slip_depth_m, 0.1), 1.0) * config.slip_speed_mps
-    constraint.allowed = _allowed(parameters, rule, distance, 0.0) + slip
+    constraint.allowed = _allowed(config, rule, distance, 0.0) + slip
     planned = min(planned, max(config.clearance_gain_per_s * left, -config.retreat_speed_mps))
     if planned < 0.0 and not _may_pass(
         constraints, k, config.retreat_authority_mps, config.max_velocity
@@ -413,7 +403,7 @@ def _receives(contacts: Records, hands: Vector, side: int, margin_m: float) -> b
 
 @compiled
 def _bring_together(
-    constraints: Records, k: int, near: Vector, at: int, heres: Records, link: int, sign: float
+    constraints: Records, k: int, near: Vector, at: int, kinematics: Struct, link: int, sign: float
 ) -> None:
     """Add to row k the speed along the normal of the point p = near[at:at + 3] of a link.
 
@@ -423,8 +413,8 @@ def _bring_together(
     sign first sets the row to 0.
     """
     row = constraints[k].row
-    tool = heres[0].position
-    jacobian = heres[0].jacobian
+    tool = kinematics.position
+    jacobian = kinematics.jacobian
     if sign > 0.0:
         row[:] = 0.0
     x = near[at] - tool[0]

@@ -33,7 +33,7 @@ from thirdhand.core.codes import (
     POSITION_BOUND,
     SPEED_BOUND,
 )
-from thirdhand.core.frame import Records, Vector
+from thirdhand.core.frame import Struct, Vector
 from thirdhand.core.numerics import ROUNDING, STOP_SECANT_TOLERANCE_M, STOP_SECANTS, TOLERANCE
 from thirdhand.core.setpoint import HULL_SPANS
 from thirdhand.core.stops import fastest_stop
@@ -51,44 +51,20 @@ def remember(hull: Vector, ticks: int, position: Vector, span_ticks: int) -> int
 
     Returns the number of targets in the newest span.
     """
-    if ticks >= span_ticks or ticks == 0:
-        if ticks > 0:
-            for span in range(HULL_SPANS - 1, 0, -1):
-                for axis in range(3):
-                    hull[span, 0, axis], hull[span, 1, axis] = (
-                        hull[span - 1, 0, axis],
-                        hull[span - 1, 1, axis],
-                    )
-        for axis in range(3):
-            hull[0, 0, axis] = hull[0, 1, axis] = position[axis]
-        return 1
-    for axis in range(3):
-        hull[0, 0, axis] = min(hull[0, 0, axis], position[axis])
-        hull[0, 1, axis] = max(hull[0, 1, axis], position[axis])
-    return ticks + 1
+    if 0 < ticks < span_ticks:
+        hull[0, 0] = np.minimum(hull[0, 0], position)
+        hull[0, 1] = np.maximum(hull[0, 1], position)
+        return ticks + 1
+    if ticks > 0:
+        for span in range(HULL_SPANS - 1, 0, -1):
+            hull[span] = hull[span - 1]
+    hull[0, 0] = position
+    hull[0, 1] = position
+    return 1
 
 
 @compiled
-def bounds_around(
-    hull: Vector,
-    ticks: int,
-    position: Vector,
-    parameters: Records,
-    box: Vector,
-    low: Vector,
-    high: Vector,
-) -> int:
-    """Add a target (3,) with `remember`, then write the `bounds` into low and high (3,) [m].
-
-    Returns the number of targets in the newest span.
-    """
-    ticks = remember(hull, ticks, position, parameters[0].span_ticks)
-    bounds(hull, box, parameters, low, high)
-    return ticks
-
-
-@compiled
-def bounds(hull: Vector, box: Vector, parameters: Records, low: Vector, high: Vector) -> None:
+def bounds(hull: Vector, box: Vector, config: Struct, low: Vector, high: Vector) -> None:
     """Write the setpoint's bounds low and high (3,) [m], from the last targets and the workspace.
 
         low  = max(box[0], lowest, smallest target - hull_margin_m)
@@ -97,7 +73,6 @@ def bounds(hull: Vector, box: Vector, parameters: Records, low: Vector, high: Ve
     `hull` (HULL_SPANS, 2, 3): smallest and largest target of each span. `box` (2, 3): lower and
     upper corner of the workspace. `lowest` (3,): planes of the reach, -inf for none.
     """
-    config = parameters[0]
     for axis in range(3):
         least = hull[0, 0, axis]
         greatest = hull[0, 1, axis]
@@ -110,7 +85,7 @@ def bounds(hull: Vector, box: Vector, parameters: Records, low: Vector, high: Ve
 
 @compiled
 def broken_bound(
-    setpoint: Vector, before: Vector, hull: Vector, box: Vector, parameters: Records
+    setpoint: Vector, before: Vector, hull: Vector, box: Vector, config: Struct
 ) -> int:
     """The first SetpointBound that a step from `before` breaks; NO_BOUND if it breaks none.
 
@@ -124,7 +99,6 @@ def broken_bound(
         POSITION      the position is beyond `bounds`, and beyond the position before, by more than
                       `longest_stop`, which is more than any stop from outside takes
     """
-    config = parameters[0]
     max_speed = config.max_speed
     longest_stop = config.longest_stop
     if not np.isfinite(setpoint).all():
@@ -140,7 +114,7 @@ def broken_bound(
         return JERK_BOUND
     low = np.empty(3)
     high = np.empty(3)
-    bounds(hull, box, parameters, low, high)
+    bounds(hull, box, config, low, high)
     for i in range(3):
         if setpoint[0, i] < min(low[i], before[0, i]) - longest_stop:
             return POSITION_BOUND
@@ -153,7 +127,7 @@ def broken_bound(
 def take_safe(  # noqa: C901, PLR0912 - a case for each bound
     setpoint: Vector,
     ahead: Vector,
-    parameters: Records,
+    config: Struct,
     costs: Vector,
     slow: float,
     low: Vector,
@@ -175,7 +149,6 @@ def take_safe(  # noqa: C901, PLR0912 - a case for each bound
 
     Returns False if all axes fell back.
     """
-    config = parameters[0]
     max_speed = config.max_speed
     max_acceleration = config.stop_acceleration
     max_jerk = config.stop_jerk
@@ -203,7 +176,7 @@ def take_safe(  # noqa: C901, PLR0912 - a case for each bound
                 farthest(ahead, i, side, max_acceleration, max_jerk, return_speed)
                 > farthest_m - required_return_m + ROUNDING
             ):
-                _fall_back(setpoint, ahead, parameters, i, low[i], high[i], return_speed)
+                _fall_back(setpoint, ahead, config, i, low[i], high[i], return_speed)
                 is_mixed = True
 
     if is_mixed:  # an axis was replaced, so the norms over all axes are checked again
@@ -219,7 +192,7 @@ def take_safe(  # noqa: C901, PLR0912 - a case for each bound
     if speed_to_come(setpoint[1], setpoint[2], max_jerk, return_speed) > max_speed:
         return_speed = 0.0  # following began too fast: all axes brake first
     for i in range(3):
-        _fall_back(setpoint, setpoint, parameters, i, low[i], high[i], return_speed)
+        _fall_back(setpoint, setpoint, config, i, low[i], high[i], return_speed)
     return False
 
 
@@ -227,7 +200,7 @@ def take_safe(  # noqa: C901, PLR0912 - a case for each bound
 def _fall_back(
     setpoint: Vector,
     out: Vector,
-    parameters: Records,
+    config: Struct,
     axis: int,
     low: float,
     high: float,
@@ -239,9 +212,9 @@ def _fall_back(
     `return_speed` [m/s] toward the inside instead. Beyond both bounds, the sign of v decides which
     one counts.
     """
-    max_acceleration = parameters[0].stop_acceleration
-    max_jerk = parameters[0].stop_jerk
-    dt = parameters[0].period_s
+    max_acceleration = config.stop_acceleration
+    max_jerk = config.stop_jerk
+    dt = config.period_s
     over = farthest(setpoint, axis, 1.0, max_acceleration, max_jerk, 0.0) > high + TOLERANCE
     under = farthest(setpoint, axis, -1.0, max_acceleration, max_jerk, 0.0) > TOLERANCE - low
     if over and under:  # the stop ends beyond both bounds

@@ -8,7 +8,7 @@ import numpy as np
 
 from kmp.compiled import compiled
 from thirdhand.core.frame import Record, Records, Vector, as_array, parameters
-from thirdhand.core.geometry import ROUND_TO, axis_of, quaternion_of, swing, turn_between, turn_on
+from thirdhand.core.geometry import axis_of, quaternion_of, rounded, swing, turn_between, turn_on
 from thirdhand.core.numerics import ROUNDING
 from thirdhand.core.tuning import TUNING, Tuning
 from thirdhand.core.vectors import dot, norm
@@ -74,7 +74,7 @@ def turn_orientation(
     of +z is followed, e is its shortest turn and target_turning loses its component about +z.
     """
     config = parameters[0]
-    dt = parameters[0].period_s
+    dt = config.period_s
     error = np.empty(3)
     desired = np.empty(3)
     axis = np.empty(3)
@@ -99,6 +99,6 @@ def turn_orientation(
         desired[i] = slower * desired[i] - turning[i]
     share = min(1.0, config.max_acceleration * dt / max(norm(desired), ROUNDING))
     for i in range(3):
-        turning[i] = np.rint((turning[i] + share * desired[i]) * ROUND_TO) / ROUND_TO
+        turning[i] = rounded(turning[i] + share * desired[i])
         desired[i] = dt * turning[i]
     turn_on(quaternion, desired)

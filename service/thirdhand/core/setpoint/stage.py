@@ -27,11 +27,10 @@ import math
 import numpy as np
 
 from thirdhand.core.arm.stage import ArmStage
-from thirdhand.core.codes import SetpointBound
 from thirdhand.core.frame import Record, Records, Vector, as_array, parameters
 from thirdhand.core.kinematics import Kinematics
 from thirdhand.core.setpoint import HULL_SPANS
-from thirdhand.core.setpoint.bounds import broken_bound, farthest
+from thirdhand.core.setpoint.bounds import farthest
 from thirdhand.core.setpoint.orientation import OrientationSetpoint
 from thirdhand.core.setpoint.step import finish, lead, ready, write
 from thirdhand.core.setpoint.tracker import gains_for, waiting
@@ -143,13 +142,6 @@ class SetpointGenerator:
         stretched = np.stack([np.minimum(box[0], ends[:, 0]), np.maximum(box[1], ends[:, 1])])
         stretched.setflags(write=False)
         return stretched
-
-    def name_of_broken_bound(self, state: Record, before: Vector, box: Vector) -> str:
-        """Name of the bound that the step from `before` (3, 3) broke; empty if there is none."""
-        bound = SetpointBound(
-            broken_bound(state["setpoint"], before, state["hull"], box, self.limits(state))
-        )
-        return bound.name.lower().replace("_", " ") if bound else ""
 
 
 class SetpointStage:

@@ -8,16 +8,23 @@ import numpy as np
 
 from kmp.compiled import compiled
 from thirdhand.core.codes import BROKEN, PLANNED, STOPPED
-from thirdhand.core.frame import Records, Vector
+from thirdhand.core.frame import Records, Struct, Vector
 from thirdhand.core.kinematics import joint_costs
 from thirdhand.core.numerics import LEAST_SPEED_MPS
-from thirdhand.core.setpoint.bounds import between, bounds_around, broken_bound, stopping, take_safe
+from thirdhand.core.setpoint.bounds import (
+    between,
+    bounds,
+    broken_bound,
+    remember,
+    stopping,
+    take_safe,
+)
 from thirdhand.core.setpoint.orientation import turn_orientation
 from thirdhand.core.vectors import distance, norm
 
 
 @compiled
-def slow_down(setpoint: Vector, tool: Vector, share: float, parameters: Records) -> float:
+def slow_down(setpoint: Vector, tool: Vector, share: float, config: Struct) -> float:
     """Share of max_speed [m/s] that a setpoint (3, 3) may use while its tool (3,) [m] is behind.
 
         1 / (1 + max(0, |setpoint - tool| - gap_free_m) / gap_slow_m)
@@ -25,7 +32,6 @@ def slow_down(setpoint: Vector, tool: Vector, share: float, parameters: Records)
     It is 1 if the setpoint moves toward its tool. If separation allows only a share < 1 of the
     setpoint's speed, the result is at most share |v| / max_speed.
     """
-    config = parameters[0]
     along = gap = 0.0
     for i in range(3):
         ahead = setpoint[0, i] - tool[i]
@@ -64,7 +70,7 @@ def lead(
     """
     state = states[0]
     config = parameters[0]
-    setpoint = states[0].setpoint
+    setpoint = state.setpoint
     target = np.empty((3, 3))
     low = np.empty(3)
     high = np.empty(3)
@@ -72,14 +78,13 @@ def lead(
     target[0] = position
     target[1] = velocity
     target[2] = acceleration
-    state.hull_ticks = bounds_around(
-        state.hull, state.hull_ticks, position, parameters, box, low, high
-    )
+    state.hull_ticks = remember(state.hull, state.hull_ticks, position, config.span_ticks)
+    bounds(state.hull, box, config, low, high)
 
     jerk = np.empty(3)
     ahead = np.empty((3, 3))
     dt = config.period_s
-    met = _track(setpoint, target, parameters, costs, slow, box, jerk)
+    met = _track(setpoint, target, config, costs, slow, box, jerk)
     for i in range(3):
         x = setpoint[0, i]
         v = setpoint[1, i]
@@ -89,9 +94,9 @@ def lead(
         ahead[1, i] = v + dt * (a + dt * j / 2.0)
         ahead[2, i] = a + dt * j
 
-    if not take_safe(setpoint, ahead, parameters, costs, slow, low, high):
+    if not take_safe(setpoint, ahead, config, costs, slow, low, high):
         met = STOPPED
-    if broken_bound(setpoint, before, state.hull, box, parameters):
+    if broken_bound(setpoint, before, state.hull, box, config):
         setpoint[:] = before
         return BROKEN
     return met
@@ -101,7 +106,7 @@ def lead(
 def _track(
     setpoint: Vector,
     target: Vector,
-    parameters: Records,
+    config: Struct,
     costs: Vector,
     slow: float,
     box: Vector,
@@ -140,12 +145,11 @@ def _track(
 
     Returns PLANNED if a barrier reduced the jerk, else 0.
     """
-    config = parameters[0]
     speed = norm(setpoint[1])
     feasible = _feasible_share(target[1], config.max_speed)
-    _tracking_jerk(setpoint, target, parameters, feasible, jerk)
-    _approach_sides(setpoint, parameters, box, jerk)
-    _limit_jerk(jerk, setpoint[2], parameters, costs)
+    _tracking_jerk(setpoint, target, config, feasible, jerk)
+    _approach_sides(setpoint, config, box, jerk)
+    _limit_jerk(jerk, setpoint[2], config, costs)
     if speed <= LEAST_SPEED_MPS:
         return 0
 
@@ -161,12 +165,12 @@ def _track(
         target_a += along[i] * target[2, i]
     motion = (speed, a, tracking)
     target_motion = (distance, target_speed, target_a)
-    reduced = _barriers(motion, target_motion, along, parameters, costs, slow)
+    reduced = _barriers(motion, target_motion, along, config, costs, slow)
     if reduced >= tracking:
         return 0
     for i in range(3):
         jerk[i] += (reduced - tracking) * along[i]
-    _limit_jerk(jerk, setpoint[2], parameters, costs)
+    _limit_jerk(jerk, setpoint[2], config, costs)
     return PLANNED
 
 
@@ -179,10 +183,10 @@ def _feasible_share(velocity: Vector, max_speed: float) -> float:
 
 @compiled
 def _tracking_jerk(
-    setpoint: Vector, target: Vector, parameters: Records, feasible: float, jerk: Vector
+    setpoint: Vector, target: Vector, config: Struct, feasible: float, jerk: Vector
 ) -> None:
     """Write the tracker's jerk (3,) [m/s³], see `_track`."""
-    gains = parameters[0].gains
+    gains = config.gains
     for i in range(3):
         jerk[i] = gains[0] * (target[0, i] - setpoint[0, i]) + gains[1] * feasible * target[1, i]
         if feasible == 1.0:  # accelerations of a target beyond the speed limit are not followed
@@ -195,7 +199,7 @@ def _barriers(
     motion: tuple[float, float, float],
     target_motion: tuple[float, float, float],
     along: Vector,
-    parameters: Records,
+    config: Struct,
     costs: Vector,
     slow: float,
 ) -> float:
@@ -204,7 +208,6 @@ def _barriers(
     `motion` has speed, acceleration and tracking jerk of the setpoint along the unit vector `along`
     (3,); `target_motion` has distance, speed and acceleration of the target.
     """
-    config = parameters[0]
     dt = config.period_s
     speed, a, tracking = motion
     distance, target_speed, target_a = target_motion
@@ -255,7 +258,7 @@ def _joint_limit(costs: Vector, along: Vector) -> float:
 
 
 @compiled
-def _approach_sides(setpoint: Vector, parameters: Records, box: Vector, jerk: Vector) -> None:
+def _approach_sides(setpoint: Vector, config: Struct, box: Vector, jerk: Vector) -> None:
     """Limit the jerk (3,) so that the setpoint approaches the workspace's sides without passing.
 
     With h the distance to the side, (d/dt + p)³ h >= 0, that is
@@ -266,7 +269,6 @@ def _approach_sides(setpoint: Vector, parameters: Records, box: Vector, jerk: Ve
     would pass its target a little, begin the fastest stop each time, and oscillate. Beyond a side,
     h is 0: the setpoint moves no farther out, and its targets bring it back.
     """
-    config = parameters[0]
     p = -0.5 * config.gains[4]
     for i in range(3):
         x = setpoint[0, i]
@@ -306,15 +308,14 @@ def _largest(costs: Vector, motion: Vector) -> float:
 
 
 @compiled
-def _limit_jerk(jerk: Vector, acceleration: Vector, parameters: Records, costs: Vector) -> None:
+def _limit_jerk(jerk: Vector, acceleration: Vector, config: Struct, costs: Vector) -> None:
     """Scale the jerk (3,) down to the limits of tool and joints, in place.
 
     First the acceleration after the period, a + dt jerk, is scaled to its limits, which gives the
     jerk; then the jerk itself is scaled to its own.
     """
-    config = parameters[0]
     ahead = np.empty(3)
-    dt = parameters[0].period_s
+    dt = config.period_s
     for i in range(3):
         ahead[i] = acceleration[i] + dt * jerk[i]
     excess = max(norm(ahead) / config.max_acceleration, _largest(costs[1], ahead))
@@ -337,7 +338,7 @@ def ready(
     joint_costs(arms, heres, costs)
     setpoint = states[0].setpoint
     tool = heres[0].position
-    return slow_down(setpoint, tool, share, parameters), distance(setpoint[0], tool)
+    return slow_down(setpoint, tool, share, parameters[0]), distance(setpoint[0], tool)
 
 
 @compiled

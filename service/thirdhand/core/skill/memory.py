@@ -17,7 +17,7 @@ import numpy as np
 
 from kmp.compiled import compiled
 from kmp.elementary import exp
-from thirdhand.core.frame import Records, Vector
+from thirdhand.core.frame import Records, Struct, Vector
 from thirdhand.core.numerics import MEMORY_STEP_S
 from thirdhand.core.skill import TURNS
 from thirdhand.core.skill.model import Seen
@@ -40,14 +40,13 @@ def _follow(now: float, share: float, rows: Vector) -> None:
 
 
 @compiled
-def remember(states: Records, period_s: float, lag_s: float, turn_lag_s: float) -> None:
+def remember(state: Struct, period_s: float, lag_s: float, turn_lag_s: float) -> None:
     """Update the memory of both hands' positions, with the time constant `lag_s`, and of their
     orientations, with `turn_lag_s`: share = 1 - exp(-elapsed time / time constant).
 
     For positions, the elapsed time is at most MEMORY_LONGEST_STEP_S. A hand's first sample is taken
     into all filters at once.
     """
-    state = states[0]
     for side in range(2):
         if state.hand_ticks[side] < 0:
             continue
@@ -151,18 +150,13 @@ def recall(states: Records, rules: Records, seen: Seen) -> bool:
     state = states[0]
     rule = rules[0]
     now = seen.now
-    remember(states, rule.period_s, rule.lag_s, rule.turn_lag_s)
+    remember(state, rule.period_s, rule.lag_s, rule.turn_lag_s)
     for n in range(2):
         side = rule.sides[n]
         seen.stillness[n] = state.hand_stillness[side]
-        for i in range(3):
-            for order in range(3):
-                now[order, 3 * n + i] = state.hands[side, order, i]
-            for row in range(len(seen.past)):
-                seen.past[row, 3 * n + i] = state.memory[row, side, i]
-        for i in range(9):
-            for row in range(len(seen.turns)):
-                seen.turns[row, 9 * n + i] = state.turns[row, side, i]
+        now[:, 3 * n : 3 * n + 3] = state.hands[side]
+        seen.past[:, 3 * n : 3 * n + 3] = state.memory[:, side]
+        seen.turns[:, 9 * n : 9 * n + 9] = state.turns[:, side]
     if rule.late_s == 0.0:
         seen.moving[:] = now
     else:

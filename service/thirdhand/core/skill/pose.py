@@ -13,7 +13,7 @@ import numpy as np
 from kmp.compiled import compiled
 from kmp.elementary import sin_cos
 from thirdhand.core.frame import Vector
-from thirdhand.core.geometry import turn_on
+from thirdhand.core.geometry import round_to, rounded, turn_on
 from thirdhand.core.skill.tuning import (
     GRIPPER_CLOSE_ABOVE,
     GRIPPER_MOVES_S,
@@ -23,6 +23,7 @@ from thirdhand.core.skill.tuning import (
 
 if TYPE_CHECKING:
     from kmp import KMP
+from thirdhand.core.vectors import add_product, dot, times
 
 
 def decided(gripper: int, closure: float, *, since_s: float = math.inf, off: float = 0.0) -> int:
@@ -111,7 +112,7 @@ _NOTHING = np.zeros((3, 3))  # in place of a covariance that need not be compute
 
 
 @compiled
-def _turned(  # noqa: C901, PLR0912 - one nest of loops
+def _turned(
     zeta: Vector,
     rate: Vector,
     covariance: Vector,
@@ -134,11 +135,10 @@ def _turned(  # noqa: C901, PLR0912 - one nest of loops
     """
     vector = np.empty(3)
     per_zeta = np.empty((3, 3))
-    part = np.empty((3, 3))
-    square = 0.0
+    part = np.zeros((3, 3))
     for i in range(3):
-        vector[i] = 2.0 * np.rint(zeta[i] * TURN_ROUND_TO) / TURN_ROUND_TO
-        square += vector[i] * vector[i]
+        vector[i] = 2.0 * rounded(zeta[i], TURN_ROUND_TO)
+    square = dot(vector, vector)
     angle = math.sqrt(square)
 
     # factors of [φ]× and [φ]×² in J_l, then `per_zeta` = J
@@ -158,18 +158,11 @@ def _turned(  # noqa: C901, PLR0912 - one nest of loops
         per_zeta[j, k] -= 2.0 * first * vector[i]
         per_zeta[k, j] += 2.0 * first * vector[i]
 
+    turning[:] = times(per_zeta, rate)
     for i in range(3):
-        turning[i] = 0.0
-        for j in range(3):
-            turning[i] += per_zeta[i, j] * rate[j]
-            part[i, j] = 0.0
-            for k in range(3):
-                part[i, j] += per_zeta[i, k] * covariance[k, j]
-        turning[i] = np.rint(turning[i] * TURN_ROUND_TO) / TURN_ROUND_TO
-    for i in range(3):
-        for j in range(3):
-            turned[i, j] = 0.0
-            for k in range(3):
-                turned[i, j] += part[i, k] * per_zeta[j, k]
-            turned[i, j] = np.rint(turned[i, j] * COVARIANCE_ROUND_TO) / COVARIANCE_ROUND_TO
+        turning[i] = rounded(turning[i], TURN_ROUND_TO)
+    turned[:] = 0.0
+    add_product(per_zeta, covariance, part)
+    add_product(part, per_zeta.T, turned)
+    round_to(turned, COVARIANCE_ROUND_TO)
     turn_on(quaternion, vector)

@@ -19,7 +19,7 @@ from kmp.elementary import exp, tanh
 from kmp.loops.kernel_row import add_weighted
 from kmp.loops.mean import add_table
 from thirdhand.core.frame import Record, Records, Vector
-from thirdhand.core.geometry import ROUND_TO, round_to
+from thirdhand.core.geometry import ROUND_TO, round_to, rounded
 from thirdhand.core.numerics import MOTION_STEP_S, UNPRIMED_DECIDED
 from thirdhand.core.skill.memory import turning
 from thirdhand.core.skill.model import COVARIANCE_ROUND_TO, MOTION_ROUND_TO, Seen
@@ -268,7 +268,7 @@ def off_all(hands: Vector, segments: Records) -> float:
         for k in range(len(segments)):
             nearest = min(nearest, on_way(hands[3 * side : 3 * side + 3], segments[k], side)[1])
         farther = max(farther, nearest)
-    return float(np.rint(farther * MOTION_ROUND_TO) / MOTION_ROUND_TO)
+    return rounded(farther, MOTION_ROUND_TO)
 
 
 @compiled
@@ -396,10 +396,7 @@ def _ambiguity(belief: Vector, tools: Vector) -> float:
 
     Segments below LEAST_SEGMENT_PROBABILITY are left out.
     """
-    most = 0
-    for k in range(len(tools)):
-        if belief[k] > belief[most]:
-            most = k
+    most = belief[: len(tools)].argmax()
     out = 0.0
     for k in range(len(tools)):
         if belief[k] < LEAST_SEGMENT_PROBABILITY or k == most:
@@ -549,12 +546,10 @@ def elsewhere(
         return 0.0
     recognise(unprimed, now, period_s, segments, 1.0)
     count = len(segments)
-    most = 0
+    most = belief[:count].argmax()
     difference = 0.0
     for k in range(count):
         difference = max(difference, abs(unprimed[k] - belief[k]))
-        if belief[k] > belief[most]:
-            most = k
     if difference < LEAST_SEGMENT_PROBABILITY:
         unprimed[0] = UNPRIMED_DECIDED
         return 0.0

@@ -12,6 +12,7 @@ from kmp.compiled import compiled
 from kmp.elementary import acos, exp, sin_cos
 from thirdhand.core.codes import AMBIGUOUS
 from thirdhand.core.frame import Records, Vector
+from thirdhand.core.geometry import rounded
 from thirdhand.core.skill.model import COVARIANCE_ROUND_TO, REGION_95
 from thirdhand.core.skill.skill import is_inside
 from thirdhand.core.skill.support import error_probability
@@ -53,7 +54,7 @@ def calibrate(
     for i in range(3):
         for j in range(3):
             variance = scale * (covariance[i, j] + std_s * std_s * velocity[i] * velocity[j])
-            out[i, j] = np.rint(variance * COVARIANCE_ROUND_TO) / COVARIANCE_ROUND_TO
+            out[i, j] = rounded(variance, COVARIANCE_ROUND_TO)
 
     # the largest eigenvalue (Smith 1961)
     mean = (out[0, 0] + out[1, 1] + out[2, 2]) / 3.0

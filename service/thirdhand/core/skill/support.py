@@ -40,6 +40,7 @@ from kmp.compiled import compiled
 from kmp.elementary import exp, log
 from kmp.loops.mean import add_table, exponentials, sum_products, table_of
 from thirdhand.core.frame import Vector
+from thirdhand.core.geometry import rounded
 from thirdhand.core.numerics import PROBABILITY_ROUND_TO
 from thirdhand.core.skill.task_clock import TaskClock
 from thirdhand.core.skill.tuning import (
@@ -170,8 +171,7 @@ def error_probability(covariance: Vector, added: float, signs: float, weights: V
     if trace <= 0.0:
         return 0.0
     logit = weights[0] + weights[1] * log(trace / UNSURE_M**2) + signs
-    probability = 1.0 / (1.0 + exp(-logit))
-    return float(np.rint(probability * PROBABILITY_ROUND_TO) / PROBABILITY_ROUND_TO)
+    return rounded(1.0 / (1.0 + exp(-logit)), PROBABILITY_ROUND_TO)
 
 
 def stretch_of(clock: TaskClock | None, inputs: Vector) -> Vector:

@@ -247,14 +247,11 @@ def move(states: Records, sides: NDArray[np.int64], period_s: float, rows: Vecto
     hands = np.empty(6)
     speed = 0.0
     still = 1.0
-    segment = 0
+    segment = state.segment_belief[: len(rows)].argmax()
     for i in range(2):
         hands[3 * i : 3 * i + 3] = state.hands[sides[i], 0]
         speed = max(speed, norm(state.hand_velocity_lowpass[sides[i]]))
         still = min(still, state.hand_stillness[sides[i]])
-    for k in range(len(rows)):
-        if state.segment_belief[k] > state.segment_belief[segment]:
-            segment = k
     if count(hands, speed, still, passed_s, segment, rows, state.task_clock):
         forget(states)
 

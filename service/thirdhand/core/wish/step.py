@@ -19,9 +19,17 @@ from thirdhand.core.codes import (
     OLDER,
     OUT_OF_RANGE,
 )
-from thirdhand.core.frame import Record, Records, Vector
+from thirdhand.core.frame import Record, Records, Struct, Vector
 from thirdhand.core.geometry import normalise, turn_between, turn_on
-from thirdhand.core.vectors import dot, squared_distance
+from thirdhand.core.vectors import (
+    add_product,
+    dot,
+    norm,
+    square,
+    squared_distance,
+    times,
+    transform,
+)
 from thirdhand.core.wish import MOST_WISHES
 from thirdhand.core.wish.tuning import FADING_SHARE, RETAINED
 
@@ -55,22 +63,18 @@ def take(
     wish = wishes[0]
     rule = rules[0]
     pose = np.empty(7)
-    for i in range(3):
-        pose[i] = mapping[i, 3]
-        for k in range(3):
-            pose[i] += mapping[i, k] * position[k]
-    for k in range(4):
-        pose[3 + k] = orientation[k]
-    cause = _fault(rules, pose, ahead_s, covariance)
+    transform(mapping[:3, :3], mapping[:3, 3], position, pose)
+    pose[3:] = orientation
+    cause = _fault(rule, pose, ahead_s, covariance)
     if cause >= 0:
         return cause
     normalise(pose[3:])
     turn_on(pose[3:], mapping[3, :3])
     due = tick + ahead_s / rule.period_s
-    if not _insert(wishes, rules, tick, due, pose):
+    if not _insert(wish, rule, tick, due, pose):
         return AHEAD
     _carry(covariance[:3, :3], mapping, 1.0, rule.unknown_std_m**2, wish.wish_covariances[:3])
-    unit = math.sqrt(dot(mapping[0, :3], mapping[0, :3]))
+    unit = norm(mapping[0, :3])
     _carry(
         covariance[3:, 3:], mapping, 1.0 / unit, rule.unknown_std_rad**2, wish.wish_covariances[3:]
     )
@@ -79,9 +83,8 @@ def take(
 
 
 @compiled
-def _fault(rules: Records, pose: Vector, ahead_s: float, covariance: Vector) -> int:
+def _fault(rule: Struct, pose: Vector, ahead_s: float, covariance: Vector) -> int:
     """Cause for which a pose (7,) in frame base is rejected, or -1."""
-    rule = rules[0]
     if not (np.isfinite(pose).all() and np.isfinite(covariance).all()):
         return NOT_FINITE
     for i in range(6):
@@ -91,10 +94,10 @@ def _fault(rules: Records, pose: Vector, ahead_s: float, covariance: Vector) -> 
             most = covariance[i, i] * covariance[j, j]
             if covariance[i, j] ** 2 > (1.0 + 1e-9) * most:
                 return NOT_FINITE
-    norm = math.sqrt(dot(pose[3:6], pose[3:6]) + pose[6] * pose[6])
-    if abs(norm - 1.0) > rule.norm_tolerance:
+    length = math.sqrt(square(pose[3:6]) + pose[6] * pose[6])
+    if abs(length - 1.0) > rule.norm_tolerance:
         return NOT_A_ROTATION
-    if dot(pose[:3], pose[:3]) > rule.farthest_m**2:
+    if square(pose[:3]) > rule.farthest_m**2:
         return OUT_OF_RANGE
     if ahead_s > rule.farthest_s:
         return AHEAD
@@ -119,7 +122,7 @@ def _carry(covariance: Vector, mapping: Vector, scale: float, unknown: float, ou
 
 
 @compiled
-def _insert(wishes: Records, rules: Records, tick: int, due: float, pose: Vector) -> bool:
+def _insert(wish: Struct, rule: Struct, tick: int, due: float, pose: Vector) -> bool:
     """Put a pose (7,) that is due at the tick `due` into the path. False if there is no room.
 
     Where an earlier chunk has the path x already, until a time u after the tick, the pose p that is
@@ -129,9 +132,7 @@ def _insert(wishes: Records, rules: Records, tick: int, due: float, pose: Vector
     from the path is noted as a leap, from the pose before it on; where the path has ended, leap_mps
     is added for the time since.
     """
-    wish = wishes[0]
-    rule = rules[0]
-    count = _forget_passed(wishes, wish.wish_count, tick)
+    count = _forget_passed(wish, wish.wish_count, tick)
     wish.wish_count = count
     since = due - wish.wish_newest_due
     if count and 0.0 <= since < rule.nearest_ticks - 1e-6:
@@ -139,7 +140,7 @@ def _insert(wishes: Records, rules: Records, tick: int, due: float, pose: Vector
     if count == MOST_WISHES:
         return False
     if count:
-        _merge(wishes, rules, tick, due, pose)
+        _merge(wish, rule, tick, due, pose)
 
     begin = wish.wish_newest_due if since > 0.0 else due - rule.nearest_ticks
     wish.wish_newest_due = due
@@ -163,15 +164,13 @@ def _insert(wishes: Records, rules: Records, tick: int, due: float, pose: Vector
 
 
 @compiled
-def _merge(wishes: Records, rules: Records, tick: int, due: float, pose: Vector) -> None:
+def _merge(wish: Struct, rule: Struct, tick: int, due: float, pose: Vector) -> None:
     """Replace a pose (7,) by its mean with the path of earlier chunks, or note a leap; see
     `_insert`.
     """
-    wish = wishes[0]
-    rule = rules[0]
     motion = np.empty((3, 6))
     quaternion = np.empty(4)
-    at(wishes, rules, due, motion, quaternion)
+    at(wish, rule, due, motion, quaternion)
     last_due = wish.wish_due[wish.wish_count - 1]
     leap_m = rule.leap_m + rule.leap_mps * max(due - last_due, 0.0) * rule.period_s
     if squared_distance(pose[:3], motion[0, :3]) > leap_m * leap_m:
@@ -197,9 +196,8 @@ def _merge(wishes: Records, rules: Records, tick: int, due: float, pose: Vector)
 
 
 @compiled
-def _forget_passed(wishes: Records, count: int, tick: int) -> int:
+def _forget_passed(wish: Struct, count: int, tick: int) -> int:
     """Drop the poses that no velocity is estimated from any more. Returns how many are left."""
-    wish = wishes[0]
     first = 0
     while count - first > RETAINED and wish.wish_due[first + RETAINED] <= tick:
         first += 1
@@ -211,11 +209,10 @@ def _forget_passed(wishes: Records, count: int, tick: int) -> int:
 
 
 @compiled
-def _slope(wishes: Records, i: int, axis: int, steady_ticks: float) -> float:
+def _slope(wish: Struct, i: int, axis: int, steady_ticks: float) -> float:
     """Slope [m/tick] of the path at its pose i along an axis: that of the line between the poses
     around it; at the end, that of the line that fits the poses of the last steady_ticks best.
     """
-    wish = wishes[0]
     due = wish.wish_due
     poses = wish.wish_poses
     count = wish.wish_count
@@ -223,8 +220,8 @@ def _slope(wishes: Records, i: int, axis: int, steady_ticks: float) -> float:
         return 0.0
     if i + 1 < count:
         before = max(i - 1, 0)
-        way = poses[i + 1, axis] - poses[before, axis]
-        return float(way / (due[i + 1] - due[before]))
+        rise_m = poses[i + 1, axis] - poses[before, axis]
+        return float(rise_m / (due[i + 1] - due[before]))
 
     first = count - 2
     while first > max(count - RETAINED, 0) and due[i] - due[first - 1] <= steady_ticks:
@@ -244,7 +241,7 @@ def _slope(wishes: Records, i: int, axis: int, steady_ticks: float) -> float:
 
 
 @compiled
-def at(wishes: Records, rules: Records, due: float, motion: Vector, quaternion: Vector) -> None:
+def at(wish: Struct, rule: Struct, due: float, motion: Vector, quaternion: Vector) -> None:
     """The path at the time `due` [ticks]: position and its derivatives [m, s] in the first three
     columns of `motion` (3, 6), angular velocity [rad/s] in row 1 of the others; orientation in
     `quaternion` (4,).
@@ -257,8 +254,6 @@ def at(wishes: Records, rules: Records, due: float, motion: Vector, quaternion: 
     and the orientation turns evenly. After the last pose it goes on for steady_ticks, as the next
     pose may be late, and comes to rest evenly within as long.
     """
-    wish = wishes[0]
-    rule = rules[0]
     last = wish.wish_count - 1
     motion[:] = 0.0
     if due <= wish.wish_due[0] or last == 0:
@@ -266,7 +261,7 @@ def at(wishes: Records, rules: Records, due: float, motion: Vector, quaternion: 
         quaternion[:] = wish.wish_poses[0, 3:]
         return
     if due >= wish.wish_due[last]:
-        _beyond(wishes, rules, due - wish.wish_due[last], motion)
+        _beyond(wish, rule, due - wish.wish_due[last], motion)
         quaternion[:] = wish.wish_poses[last, 3:]
         return
 
@@ -278,14 +273,14 @@ def at(wishes: Records, rules: Records, due: float, motion: Vector, quaternion: 
     h_s = h * rule.period_s
     for axis in range(3):
         start = wish.wish_poses[i, axis]
-        way = wish.wish_poses[i + 1, axis] - start
-        begin = h * _slope(wishes, i, axis, rule.steady_ticks)
-        end = h * _slope(wishes, i + 1, axis, rule.steady_ticks)
-        cubic = begin + end - 2.0 * way
-        square = 3.0 * way - 2.0 * begin - end
-        motion[0, axis] = start + s * (begin + s * (square + s * cubic))
-        motion[1, axis] = (begin + s * (2.0 * square + 3.0 * s * cubic)) / h_s
-        motion[2, axis] = (2.0 * square + 6.0 * s * cubic) / (h_s * h_s)
+        rise = wish.wish_poses[i + 1, axis] - start
+        begin = h * _slope(wish, i, axis, rule.steady_ticks)
+        end = h * _slope(wish, i + 1, axis, rule.steady_ticks)
+        cubic = begin + end - 2.0 * rise
+        bend = 3.0 * rise - 2.0 * begin - end
+        motion[0, axis] = start + s * (begin + s * (bend + s * cubic))
+        motion[1, axis] = (begin + s * (2.0 * bend + 3.0 * s * cubic)) / h_s
+        motion[2, axis] = (2.0 * bend + 6.0 * s * cubic) / (h_s * h_s)
     turn = np.empty(3)
     turn_between(wish.wish_poses[i, 3:], wish.wish_poses[i + 1, 3:], turn)
     for axis in range(3):
@@ -296,17 +291,15 @@ def at(wishes: Records, rules: Records, due: float, motion: Vector, quaternion: 
 
 
 @compiled
-def _beyond(wishes: Records, rules: Records, passed: float, motion: Vector) -> None:
+def _beyond(wish: Struct, rule: Struct, passed: float, motion: Vector) -> None:
     """The path `passed` ticks after its last pose, written to `motion` as by `at`."""
-    wish = wishes[0]
-    rule = rules[0]
     last = wish.wish_count - 1
     h = rule.steady_ticks
     slowing = min(max(passed - h, 0.0), h)
     gone = min(passed, h) + slowing - 0.5 * slowing * slowing / h
     share = 1.0 - slowing / h
     for axis in range(3):
-        slope = _slope(wishes, last, axis, rule.steady_ticks)
+        slope = _slope(wish, last, axis, rule.steady_ticks)
         motion[0, axis] = wish.wish_poses[last, axis] + slope * gone
         motion[1, axis] = slope * share / rule.period_s
 
@@ -321,9 +314,9 @@ def lead(wishes: Records, rules: Records, frames: Records, tick: int, sources: i
     motion = np.zeros((3, 6))
     quaternion = np.empty(4)
     if sources & BY_WISHES:
-        at(wishes, rules, float(tick), motion, quaternion)
+        at(wish, rules[0], float(tick), motion, quaternion)
         if sources & BY_SKILL:
-            _weigh(wishes, frames, motion, quaternion)
+            _weigh(wish, frame, motion, quaternion)
         else:
             frame.covariance[:] = wish.wish_covariances[:3]
             frame.orientation_covariance[:] = wish.wish_covariances[3:]
@@ -334,7 +327,7 @@ def lead(wishes: Records, rules: Records, frames: Records, tick: int, sources: i
         motion[1, 3:] = frame.turning
         quaternion[:] = frame.orientation
 
-    _join(wishes, rules, tick, sources, motion, quaternion)
+    _join(wish, rules[0], tick, sources, motion, quaternion)
     frame.target[:] = motion[0, :3]
     frame.target_velocity[:] = motion[1, :3]
     frame.target_acceleration[:] = motion[2, :3]
@@ -343,7 +336,7 @@ def lead(wishes: Records, rules: Records, frames: Records, tick: int, sources: i
 
 
 @compiled
-def _weigh(wishes: Records, frames: Records, motion: Vector, quaternion: Vector) -> None:
+def _weigh(wish: Struct, frame: Struct, motion: Vector, quaternion: Vector) -> None:
     """Replace the wishes' `motion` and `quaternion` by their product with the skill's prediction in
     the frame, as that of two Gaussians with the covariances A of the skill and B of the wishes:
 
@@ -352,24 +345,19 @@ def _weigh(wishes: Records, frames: Records, motion: Vector, quaternion: Vector)
     W is constant where it is differentiated. Orientations are weighed by tr A / (tr A + tr B); a
     skill that has learned none leaves it to the wishes.
     """
-    wish = wishes[0]
-    frame = frames[0]
     skill = frame.covariance
     weight = _gain(skill, wish.wish_covariances[:3])
-    less = np.empty((3, 3))
-    for i in range(3):
-        for j in range(3):
-            less[i, j] = dot(weight[i], skill[:, j])
-    off = motion[:, :3].copy()
-    off[0] -= frame.target
-    off[1] -= frame.target_velocity
-    off[2] -= frame.target_acceleration
-    for i in range(3):
-        motion[0, i] = frame.target[i] + dot(weight[i], off[0])
-        motion[1, i] = frame.target_velocity[i] + dot(weight[i], off[1])
-        motion[2, i] = frame.target_acceleration[i] + dot(weight[i], off[2])
+    less = np.zeros((3, 3))
+    add_product(weight, skill, less)
+    difference = motion[:, :3].copy()
+    difference[0] -= frame.target
+    difference[1] -= frame.target_velocity
+    difference[2] -= frame.target_acceleration
+    motion[0, :3] = frame.target + times(weight, difference[0])
+    motion[1, :3] = frame.target_velocity + times(weight, difference[1])
+    motion[2, :3] = frame.target_acceleration + times(weight, difference[2])
     frame.covariance -= less
-    _weigh_turn(wishes, frames, motion, quaternion)
+    _weigh_turn(wish, frame, motion, quaternion)
 
 
 @compiled
@@ -387,18 +375,14 @@ def _gain(skill: Vector, wish: Vector) -> Vector:
             d = (i + 2) % 3
             inverse[i, j] = total[a, c] * total[b, d] - total[a, d] * total[b, c]
     inverse /= dot(total[0], inverse[:, 0])
-    gain = np.empty((3, 3))
-    for i in range(3):
-        for j in range(3):
-            gain[i, j] = dot(skill[i], inverse[:, j])
+    gain = np.zeros((3, 3))
+    add_product(skill, inverse, gain)
     return gain
 
 
 @compiled
-def _weigh_turn(wishes: Records, frames: Records, motion: Vector, quaternion: Vector) -> None:
+def _weigh_turn(wish: Struct, frame: Struct, motion: Vector, quaternion: Vector) -> None:
     """The part of `_weigh` that concerns the orientation."""
-    wish = wishes[0]
-    frame = frames[0]
     variance = 0.0
     total_variance = 0.0
     for i in range(3):
@@ -421,7 +405,7 @@ def _weigh_turn(wishes: Records, frames: Records, motion: Vector, quaternion: Ve
 
 @compiled
 def _join(
-    wishes: Records, rules: Records, tick: int, sources: int, motion: Vector, quaternion: Vector
+    wish: Struct, rule: Struct, tick: int, sources: int, motion: Vector, quaternion: Vector
 ) -> None:
     """Make the target of this tick from what leads now, `motion` (3, 6) and `quaternion` (4,) as
     written by `at`: an offset d is added, which fades out.
@@ -438,15 +422,13 @@ def _join(
 
     After a gap longer than goes_on_s the path is followed as it is.
     """
-    wish = wishes[0]
-    rule = rules[0]
     offset = wish.wish_offset
     passed_s = (tick - wish.wish_told_tick) * rule.period_s
     changed = wish.wish_is_new or sources != wish.wish_sources
     if wish.wish_count and sources != BY_SKILL:
         changed = changed or wish.wish_told_tick < wish.wish_due[0] <= tick  # the path begins
     if changed or tick != wish.wish_told_tick + 1:
-        _begin_offset(wishes, rules, passed_s, motion, quaternion)
+        _begin_offset(wish, rule, passed_s, motion, quaternion)
     _fade(offset, wish.wish_rate, min(passed_s, rule.goes_on_s))
 
     motion += offset
@@ -461,11 +443,9 @@ def _join(
 
 @compiled
 def _begin_offset(
-    wishes: Records, rules: Records, passed_s: float, motion: Vector, quaternion: Vector
+    wish: Struct, rule: Struct, passed_s: float, motion: Vector, quaternion: Vector
 ) -> None:
     """Set the offset of `passed_s` ago and its rate, so that the target goes on from then."""
-    wish = wishes[0]
-    rule = rules[0]
     offset = wish.wish_offset
     if passed_s > rule.goes_on_s:
         offset[:] = 0.0
@@ -485,7 +465,7 @@ def _begin_offset(
     turn_on(before, step)
     turn_between(before, wish.wish_turn, offset[0, 3:])
     turn = offset[0, 3:]
-    away_m = math.sqrt(dot(offset[0, :3], offset[0, :3]) + rule.rad_as_m**2 * dot(turn, turn))
+    away_m = math.sqrt(square(offset[0, :3]) + rule.rad_as_m**2 * square(turn))
     wish.wish_rate = rule.fade_rate_per_s
     if away_m * FADING_SHARE * rule.fade_rate_per_s > rule.fade_mps:
         wish.wish_rate = rule.fade_mps / (FADING_SHARE * away_m)

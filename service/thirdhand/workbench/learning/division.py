@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 
 from thirdhand.contract.requests import ViaPoint
 from thirdhand.core.frame import Records, Vector
-from thirdhand.core.intake.hand_estimator import stillness_of
 from thirdhand.core.skill import TURNS
 from thirdhand.core.skill.memory import along as filtered
 from thirdhand.core.skill.memory import turn_lag_s
@@ -28,7 +27,7 @@ from thirdhand.core.skill.segments import LEFT, MOST_SEGMENTS, NONE, RIGHT
 from thirdhand.core.skill.task import Indices, NamedViaPoints, Task
 from thirdhand.core.skill.tuning import DIRECTION_SPEED_MPS, WITH_HAND_POWER
 from thirdhand.skills.demonstration import Demonstration
-from thirdhand.skills.recognition import all_followed, covered
+from thirdhand.skills.recognition import all_followed, covered, stillness_of
 from thirdhand.skills.skill_file import SkillError
 
 SMOOTHED_S = 0.28  # width of the window that smooths hands and tool

@@ -17,9 +17,9 @@ from thirdhand.contract.other_types import Refusal
 from thirdhand.contract.requests import Hands, encode_json
 from thirdhand.core.frame import Vector
 from thirdhand.core.geometry import rotation
-from thirdhand.core.intake.far_away import too_far
 from thirdhand.core.intake.stage import UNIT_M, base_from
 from thirdhand.core.tuning import TUNING
+from thirdhand.daemon.far_away import too_far
 from thirdhand.recordings.mcap_file import McapFile, RecordingError, ends_early, existing
 from thirdhand.recordings.mcap_reader import Messages
 from thirdhand.settings.config import HandSettings, Settings

@@ -16,7 +16,7 @@ import numpy as np
 from ruckig import InputParameter, Ruckig, Synchronization, Trajectory
 
 from thirdhand.contract.records import SIDES, Flag
-from thirdhand.core.arm.stage import ArmStage, Closing
+from thirdhand.core.arm.stage import ArmStage
 from thirdhand.core.frame import Event, Tick, Vector
 from thirdhand.core.limiter.stage import Limiter
 from thirdhand.core.separation import FARTHEST_REPORTED_M
@@ -106,8 +106,11 @@ class _Chain:
         self.skill = skill
         self.settings = settings
         # Rivals plan no stop: the speed of a tool far from its target is not reduced.
-        eager = Closing(settings.tool.acceleration / 2, settings.tool.max_speed, far_damping=0.0)
-        self.arm = ArmStage(settings, robot_description(settings), eager)
+        self.arm = ArmStage(settings, robot_description(settings))
+        self.arm.parameters["closing_braking"] = settings.tool.acceleration / 2
+        self.arm.parameters["closing_speed"] = settings.tool.max_speed
+        self.arm.parameters["far_speed"] = 0.5 * settings.tool.max_speed
+        self.arm.parameters["far_damping"] = 0.0
         self.limiter = Limiter(settings.joints, settings.period_s)
         self.orientation = skill.orientation
 
