@@ -5,6 +5,7 @@ to rest, and follows the next daemon.
 from __future__ import annotations
 
 import contextlib
+import math
 import re
 import signal
 import subprocess
@@ -17,13 +18,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zenoh
+from hypothesis import given
+from hypothesis import strategies as st
 
 from support.arms import MODELS, toml_of
 from support.cell import LEFT, Tracker, serving, thirdhand, told, until
 from support.franka_cell import assert_allowed, franka_toml, robot, simulated
 from support.paths import ROOT
 from thirdhand.arms import place_of
-from thirdhand.arms.arm import Arm
+from thirdhand.arms.arm import ATTRIBUTES, Arm
 from thirdhand.arms.drive import follow
 from thirdhand.arms.simulated import SimulatedArm
 from thirdhand.client import UnreachableError, endpoints, open_session
@@ -32,7 +35,7 @@ from thirdhand.contract.explain import ExplainedError
 from thirdhand.core.frame import Vector
 from thirdhand.core.limiter.stage import Limited
 from thirdhand.daemon.launch import free_port
-from thirdhand.process.own_class import own_class
+from thirdhand.process.own_class import explained, own_class
 from thirdhand.settings.config import Settings
 
 NEAR_LEFT = (0.85, -0.30, 0.10)
@@ -245,22 +248,39 @@ def test_rate_without_room_to_brake_is_refused(program: str, tmp_path: Path) -> 
         ("x = 1 + ''", "TypeError: unsupported operand"),
         ("from dataclasses import dataclass\n@dataclass\nclass A:\n  x: int", "is no class of"),
         ("class B: pass", "has no attribute 'A'"),
-        ("return [0.0], [0.0]", "A.read gives 1 positions and 1 velocities; 7 of each needed"),
-        ("return 2 * ([math.nan] * 7,)", "A.read gives a joint that is not finite"),
-        ("return 1 / 0", "A stopped: ZeroDivisionError('division by zero')"),
+        ("read: return [0.0], [0.0]", "A.read gives 1 positions and 1 velocities; positions and"),
+        ("read: return 2 * ([[0.0]] * 7,)", "gives positions of shape (7, 1) and velocities of"),
+        ("read: return [0.0] * 7, None", "gives 7 positions and velocities of shape (); positions"),
+        ("read: return [0.0, 0.0, 0.0]", "gives [0.0, 0.0, 0.0]; positions and velocities needed"),
+        ("read: return 2 * ([math.nan] * 7,)", "A.read gives a joint that is not finite"),
+        ("read: return 1 / 0", "A.read: mine.py:3: ZeroDivisionError: division by zero"),
+        ("read: assert helper()", "A.read: mine.py:5: ZeroDivisionError: division by zero"),
+        ("wait: return None", "A.wait gives None; the time [s] since it was called last needed"),
+        ("speak: pass", "mine.py:A has no read, write, which a class of thirdhand.Arm needs"),
+        ("__init__: pass", "A.__init__ does not call super().__init__(settings, address)"),
+        ("__init__: 1 / 0", "A.__init__: mine.py:3: ZeroDivisionError: division by zero"),
+        ("__enter__: assert False", "A.__enter__: mine.py:3: AssertionError"),
+        ("x = 1\ny = 1 / 0", "mine.py:A: mine.py:2: ZeroDivisionError: division by zero"),
     ],
 )
 def test_what_is_wrong_with_an_arm_of_ones_own_is_said(
     text: str, message: str, tmp_path: Path
 ) -> None:
     file = tmp_path / "mine.py"
-    if text.startswith("return"):
-        text = f"import math, thirdhand\nclass A(thirdhand.Arm):\n  def read(self): {text}"
+    method, _, body = text.partition(": ")
+    if method in ("read", "wait", "speak", "__init__", "__enter__"):
+        kind = "thirdhand.Arm" if method == "speak" else "SimulatedArm"
+        text = (
+            "import math, thirdhand; from thirdhand.arms.simulated import SimulatedArm\n"
+            f"class A({kind}):\n  def {method}(self, *_): {body}\ndef helper():\n  return 1 / 0"
+        )
     file.write_text(text)
 
     def run() -> None:
         with open_session() as session:
-            arm = own_class(place_of(f"{file}:A"), Arm)(Settings())
+            kind = own_class(place_of(f"{file}:A"), Arm)
+            with explained(kind):
+                arm = kind(Settings())
             follow(arm, session, "thirdhand", stop=threading.Event())
 
     with pytest.raises(ExplainedError, match=re.escape(message)):
@@ -314,7 +334,9 @@ def test_an_arm_of_another_distribution_is_found_by_its_name(
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: theirs\nVersion: 1\n")
     (info / "entry_points.txt").write_text("[thirdhand.arms]\ntheirs = their_arm:Their\n")
-    (tmp_path / "their_arm.py").write_text("import thirdhand\nclass Their(thirdhand.Arm): pass\n")
+    (tmp_path / "their_arm.py").write_text(
+        "import thirdhand\nclass Their(thirdhand.Arm): read = write = print\n"
+    )
     monkeypatch.syspath_prepend(str(tmp_path))
     assert own_class(place_of("theirs"), Arm).__name__ == "Their"
 
@@ -325,3 +347,91 @@ def test_where_no_command_comes_that_is_told_and_the_arm_stays() -> None:
     with open_session() as session, pytest.raises(UnreachableError, match=told_so):
         follow(arm, session, "thirdhand", stop=threading.Event(), wait_s=0.3)
     assert arm.position.tolist() == list(Settings().arm.posture)
+
+
+@pytest.mark.parametrize("value", [-1, 0, 20, math.nan, "0.1", None, True, print])
+@pytest.mark.parametrize("name", ATTRIBUTES)
+def test_attributes_of_a_class_are_checked(name: str, value: object) -> None:
+    is_accepted, needed = ATTRIBUTES[name]
+    accepted = {
+        **dict.fromkeys(("takes_velocity", "guided"), (True,)),
+        "speed_limits": (None, print),
+        "lag_s": (0,),
+        "gain": (20,),
+    }
+    assert is_accepted(value) == (value in accepted.get(name, ()))
+    assert is_accepted(getattr(Arm, name))
+    if is_accepted(value):
+        return
+    kind = type("Mine", (SimulatedArm,), {name: staticmethod(value) if value is print else value})
+    with open_session() as session, pytest.raises(ExplainedError, match=f"^Mine.{name}: ") as said:
+        follow(kind(Settings()), session, "thirdhand", stop=threading.Event())
+    assert str(said.value).endswith(f"{needed} needed")
+
+
+def test_each_attribute_of_an_arm_has_a_check() -> None:
+    assert ATTRIBUTES.keys() == Arm.__annotations__.keys()
+
+
+@given(
+    st.lists(st.tuples(st.floats(-1, 1), st.floats(-20, 20)), min_size=2, max_size=20),
+    st.floats(0.0, 0.5),
+    st.sampled_from((1.0, 300.0, math.inf)),
+)
+def test_what_leads_keeps_the_speed_limits(
+    moves: list[tuple[float, float]], lag_s: float, gain: float
+) -> None:
+    """Also where velocity and acceleration jump."""
+    arm = Led(Settings())
+    arm.lag_s = lag_s
+    arm.gain = gain
+    max_step = np.array(arm.limits.velocity) * arm.period_s
+    position = np.array(Settings().arm.posture)
+    still = np.zeros(7)
+    arm.lead(Limited(position, still, still, limited=False))
+    for share, acceleration in moves:
+        before = arm.written
+        velocity = share * np.array(arm.limits.velocity)
+        position = np.clip(position + velocity * arm.period_s, arm.limits.lower, arm.limits.upper)
+        arm.lead(Limited(position, velocity, np.full(7, acceleration), limited=False))
+        assert (np.abs(arm.written - before) <= max_step + 1e-9).all()
+
+
+def test_a_lead_that_is_not_finite_is_not_written() -> None:
+    arm = Led(Settings())
+    arm.lag_s = math.nan
+    still = np.zeros(7)
+    with pytest.raises(ExplainedError, match=r"lag_s nan and gain inf given; 0 to 0\.5 s and"):
+        arm.lead(Limited(arm.position, still, still, limited=False))
+    assert not hasattr(arm, "written")
+
+
+BLOCKS = """import time
+from thirdhand.arms.simulated import SimulatedArm
+class Blocks(SimulatedArm):
+    def __exit__(self, *_):
+        print("switched off", flush=True)
+    def read(self):
+        self.calls = vars(self).get("calls", 0) + 1
+        while self.calls > 20:
+            HANG
+        return super().read()
+"""
+
+
+@pytest.mark.parametrize("hang", ["time.sleep(60)", "swallowed()"])
+@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
+def test_follow_ends_while_a_method_blocks(hang: str, sent: signal.Signals, tmp_path: Path) -> None:
+    """So it does where the class catches all exceptions."""
+    file = tmp_path / "mine.py"
+    file.write_text(
+        BLOCKS.replace("HANG", hang)
+        + "def swallowed():\n    try:\n        time.sleep(60)\n    except BaseException: pass\n"
+    )
+    with (
+        serving(tmp_path) as daemon,
+        following(f"{file}:Blocks", "--connect", daemon.endpoint) as running,
+    ):
+        running.until("Blocks.read has not returned for 2 s, at mine.py:")
+        running.process.send_signal(sent)
+        assert running.process.wait(10) == 130

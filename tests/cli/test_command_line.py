@@ -153,6 +153,8 @@ REFUSED = [  # exit code, words on standard error, command
     (2, "0 given, 0.1 to 200 mm needed", "calibrate --accept 0"),
     (2, "there is no folder", "bundle --output nowhere/x.tar.gz {nobody}"),
     (2, "PORT or HOST:PORT needed", "metrics --listen no-port"),
+    (2, "--web 99999: PORT or HOST:PORT needed", "view live --web 99999 {nobody}"),
+    (2, "-1 given, 0 to 3600 s needed", "follow simulated --wait -1"),
 ]
 PATHS = {
     "nobody": " ".join(NOBODY),

@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 import zenoh
 
-from support.cell import until
+from support.cell import serving, until
 from support.installed import isolated, unpacked, wheel_of
 from support.paths import ROOT
 from thirdhand.client import (
@@ -35,8 +35,11 @@ from thirdhand.client import (
     endpoints,
     open_session,
 )
+from thirdhand.client.hands import ATTRIBUTES as HANDS_ATTRIBUTES
+from thirdhand.client.hands import Hands
 from thirdhand.client.streams import UNTURNED, Publisher, wait_until_heard
 from thirdhand.contract import cdr, channels
+from thirdhand.contract.explain import ExplainedError
 from thirdhand.contract.messages import JointState, PoseStamped
 from thirdhand.process.foreign_modules import EXTRAS
 
@@ -341,6 +344,87 @@ def test_a_tracker_and_a_follower_refuse_what_cannot_be_encoded(
                 follower.tell(position, velocity)
         tracker.publish("left", np.zeros(3), np.array([0, 0, 0, 1.0]), stamp_ns=np.int64(5))  # type: ignore[arg-type]
         follower.tell(np.zeros(2), ())  # type: ignore[arg-type]
+
+
+class Seen(Hands):
+    """Hands that a test gives, once each."""
+
+    rate_hz = 1000.0
+
+    def __init__(self, *poses: Any) -> None:
+        self.poses = [*poses]
+
+    def read(self) -> Any:
+        return self.poses.pop(0)
+
+
+@pytest.fixture
+def watched(listener: zenoh.Session) -> Iterator[tuple[Watch, Watch]]:
+    """Both hands that arrive."""
+    left = Watch(listener, "bench", "hands/left", timeout_s=10)
+    right = Watch(listener, "bench", "hands/right", timeout_s=10)
+    yield left, right
+    left.close()
+    right.close()
+
+
+BAD_POSES = [
+    ((math.nan, 0, 0), "left: [nan, 0.0, 0.0] given; finite numbers needed"),
+    ((0, 0, 0, 0, 0, 0, 2), "left: quaternion [0.0, 0.0, 0.0, 2.0] has norm 2; 1 needed"),
+    ((0, 0), "left: 2 numbers given; x y z [m], or x y z and a quaternion"),
+    (0.1, "left: 0.1 given; x y z [m], or x y z and a quaternion"),
+]
+
+
+@pytest.mark.parametrize(("pose", "message"), BAD_POSES)
+def test_own_hands_say_once_what_is_no_pose_and_count(
+    pose: Any,
+    message: str,
+    cell: Connection,
+    watched: tuple[Watch, Watch],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """As `Connection.hands` refuses it; the other hand is published."""
+    hands = Seen(*[(pose, (0.1, 0.2, 0.3))] * 3)
+    hands.publish(cell.session, "bench", is_over=lambda: not hands.poses)
+    assert next(watched[1]).position == (0.1, 0.2, 0.3)
+    first, last = capsys.readouterr().err.splitlines()
+    assert message in first
+    assert first.startswith("Seen.read: ")
+    assert last == "3 poses of Seen.read were not published"
+    with pytest.raises(ValueError, match=re.escape(message)):
+        cell.hands(left=pose)
+
+
+@pytest.mark.parametrize("hands", [None, 0.1, (None,), (None, None, None)])
+def test_own_hands_that_are_not_two_are_refused(
+    hands: Any, cell: Connection, watched: tuple[Watch, Watch]
+) -> None:
+    with pytest.raises(ExplainedError) as said:
+        Seen(hands).publish(cell.session, "bench", is_over=lambda: False)
+    assert f"Seen.read gives {hands!r}; the poses of the left and of the" in str(said.value)
+
+
+def test_a_frame_that_the_cell_does_not_know_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    hands = Seen()
+    hands.frame_id = "nowhere"
+    with serving(tmp_path) as daemon:
+        hands.publish(daemon.session, is_over=lambda: True)
+    message = "Seen.frame_id: 'nowhere' given; the cell accepts 'base', ''"
+    assert capsys.readouterr().err.splitlines() == [message]
+
+
+@pytest.mark.parametrize("value", [-1, 0, math.nan, 2000, None, True, "a" * 65])
+@pytest.mark.parametrize("name", HANDS_ATTRIBUTES)
+def test_attributes_of_own_hands_are_checked(
+    name: str, value: Any, listener: zenoh.Session
+) -> None:
+    assert HANDS_ATTRIBUTES.keys() == Hands.__annotations__.keys()
+    kind = type("Mine", (Seen,), {name: value})
+    with pytest.raises(ExplainedError, match=f"Mine.{name}: .* given; .* needed"):
+        kind().publish(listener, is_over=lambda: True)
 
 
 def test_a_closed_connection_says_so_and_ends_its_watches(listener: zenoh.Session) -> None:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from importlib.metadata import entry_points
-
 from thirdhand.contract.explain import ExplainedError
 
+PERIOD_S = (0.0005, 0.02)
+LAG_S = (0.0, 0.5)
+GAIN = (1.0, 1e6)  # [1/s²]
 GROUP = "thirdhand.arms"  # of the entry points with which other distributions name their arms
 SHIPPED = {
     "franka": "thirdhand.arms.franka:FrankaArm",
@@ -24,6 +25,8 @@ def place_of(name: str) -> str:
     """The place, MODULE:CLASS or FILE.py:CLASS, of an arm of this name, or which is this place.
     Raises DriveError.
     """
+    from importlib.metadata import entry_points  # slow to import
+
     known = SHIPPED | {entry.name: entry.value for entry in entry_points(group=GROUP)}
     place = known.get(name, name)
     if ":" not in place:

@@ -2,21 +2,36 @@
 
 from __future__ import annotations
 
+import abc
 import math
+import reprlib
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 
-from thirdhand.arms import DriveError
+from thirdhand.arms import GAIN, LAG_S, PERIOD_S, DriveError
 from thirdhand.arms.playback import SpeedLimits
 from thirdhand.core.frame import Vector
 from thirdhand.core.limiter.stage import Limited
+from thirdhand.process.own_class import Accepted, check_attributes, number
 from thirdhand.settings.config import Settings
 
 MAX_BEHIND_S = 0.05  # a loop that is later than this does not make up for its delay
+IS_BOOL: Accepted = (lambda value: isinstance(value, bool | np.bool_), "True or False")
+ATTRIBUTES: Mapping[str, Accepted] = {
+    "period_s": number(*PERIOD_S, " s"),
+    "lag_s": number(*LAG_S, " s"),
+    "gain": number(*GAIN, " 1/s²", math.inf),
+    "takes_velocity": IS_BOOL,
+    "guided": IS_BOOL,
+    "speed_limits": (
+        lambda value: value is None or callable(value),
+        "None or a function of position and velocity",
+    ),
+}
 
 
 class Arm(AbstractContextManager["Arm"]):
@@ -47,16 +62,27 @@ class Arm(AbstractContextManager["Arm"]):
         self.limits = settings.joints  # names and limits; nothing that is written exceeds them
         self.address = address
         self._due_s = time.monotonic()
+        self._position: Vector | None = None  # of the motion that `lead` wrote last
+        self._ahead = np.zeros(len(self.limits.names))  # what was written led it by this
 
+    def check(self) -> None:
+        """Raise ExplainedError for a class that cannot be driven."""
+        check_attributes(self, ATTRIBUTES)
+        if not hasattr(self, "limits"):
+            raise DriveError(
+                f"{type(self).__name__}.__init__ does not call "
+                "super().__init__(settings, address); that is needed"
+            )
+
+    @abc.abstractmethod
     def read(self) -> tuple[Sequence[float] | Vector, Sequence[float] | Vector]:
         """The measured positions and velocities (J,)."""
-        raise NotImplementedError
 
+    @abc.abstractmethod
     def write(self, position: Vector, velocity: Vector, acceleration: Vector) -> None:
         """Move the joints to this position, velocity and acceleration (J,) until the next period
         ends.
         """
-        raise NotImplementedError
 
     def wait(self) -> float:
         """Wait for the next period; the time [s] since it was called last. For a drive with a clock
@@ -79,12 +105,15 @@ class Arm(AbstractContextManager["Arm"]):
         """The joints (n,) that `read` gives: position [rad or m] and velocity [rad/s or m/s].
         Raises DriveError.
         """
-        position, velocity = (np.array(part, np.float64) for part in self.read())
-        count = len(self.limits.names)
-        if position.shape != (count,) or velocity.shape != (count,):
-            raise DriveError(
-                f"{type(self).__name__}.read gives {position.size} positions and {velocity.size} "
-                f"velocities; {count} of each needed, of {', '.join(self.limits.names)}"
+        joints: Any = self.read()
+        names = self.limits.names
+        try:
+            position, velocity = (np.array(part, np.float64) for part in joints)
+        except (TypeError, ValueError):
+            raise self._refused(reprlib.repr(joints)) from None
+        if not position.shape == velocity.shape == (len(names),):
+            raise self._refused(
+                f"{_form('positions', position)} and {_form('velocities', velocity)}"
             )
         if not (np.isfinite(position).all() and np.isfinite(velocity).all()):
             raise DriveError(f"{type(self).__name__}.read gives a joint that is not finite")
@@ -92,8 +121,37 @@ class Arm(AbstractContextManager["Arm"]):
 
     def lead(self, moved: Limited) -> None:
         """Write a motion, ahead by what its servo lags."""
-        position = moved.position + self.lag_s * moved.velocity + moved.acceleration / self.gain
+        position = moved.position
+        ahead = self.lag_s * moved.velocity + moved.acceleration / self.gain
+        if not np.isfinite(ahead).all():
+            raise DriveError(
+                f"{type(self).__name__}: lag_s {self.lag_s} and gain {self.gain} given; "
+                f"{ATTRIBUTES['lag_s'][1]} and {ATTRIBUTES['gain'][1]} needed"
+            )
+
+        # motion and lead together keep the speed limits, except where the arm was led by hand
+        before = position if self._position is None else self._position
+        max_step = np.array(self.limits.velocity) * self.period_s
+        step = np.clip(position - before, -max_step, max_step)
+        ahead = np.clip(ahead - self._ahead, -max_step - step, max_step - step) + self._ahead
+
         # an arm that stands outside its limits does not jump into them
-        lower = np.minimum(self.limits.lower, moved.position)
-        upper = np.maximum(self.limits.upper, moved.position)
-        self.write(np.clip(position, lower, upper), moved.velocity, moved.acceleration)
+        lower = np.minimum(self.limits.lower, position)
+        upper = np.maximum(self.limits.upper, position)
+        written = np.clip(position + ahead, lower, upper)
+        self._position = position
+        self._ahead = written - position
+        self.write(written, moved.velocity, moved.acceleration)
+
+    def _refused(self, joints: str) -> DriveError:
+        """The error for joints that `read` gives, in words."""
+        names = self.limits.names
+        return DriveError(
+            f"{type(self).__name__}.read gives {joints}; positions and velocities needed, "
+            f"{len(names)} of each, of {', '.join(names)}"
+        )
+
+
+def _form(what: str, values: Vector) -> str:
+    """The shape of values in words."""
+    return f"{len(values)} {what}" if values.ndim == 1 else f"{what} of shape {values.shape}"

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
+import math
 import sys
 import threading
 from collections.abc import Callable
+from numbers import Real
 
 import numpy as np
 import zenoh
@@ -12,10 +15,12 @@ import zenoh
 from thirdhand.arms import DriveError
 from thirdhand.arms.arm import Arm
 from thirdhand.arms.playback import REJOIN_RAD, Playback
+from thirdhand.arms.standstill import Standstill
 from thirdhand.client import Follower, UnreachableError
 from thirdhand.contract.channels import key
 from thirdhand.contract.explain import ExplainedError
 from thirdhand.core.frame import Vector
+from thirdhand.process.own_class import failure
 from thirdhand.settings.config import RATES_HZ
 
 SHORTEST_TICK_S = 1.0 / RATES_HZ[1]
@@ -35,24 +40,34 @@ def follow(
     stop: threading.Event,
     wait_s: float = float("inf"),
     say: Callable[[str], None] = say,
+    interrupt: Callable[[], None] = lambda: None,
 ) -> Playback:
-    """Drive an arm by a cell's commands until `stop`, then brake it.
+    """Drive an arm by a cell's commands until `stop`, then brake it. `interrupt` is called, from
+    another thread, where a method of the arm does not return after `stop`.
 
     Raises DriveError, also if commands arrive too slowly to be followed, and UnreachableError if no
     command arrives within `wait_s` [s].
     """
+    arm.check()
+    standstill = Standstill(type(arm), stop=stop, say=say, interrupt=interrupt)
     try:
-        playback = Playback(
-            arm.limits, arm.measured()[0], period_s=arm.period_s, speed_limits=arm.speed_limits
-        )
-        with Follower(session, arm.limits.names, cell) as follower, arm:
-            driving = _Driving(arm, playback, follower, cell, wait_s, say)
-            while not driving.step(stop):
-                pass
+        with contextlib.closing(standstill):
+            playback = Playback(
+                arm.limits, arm.measured()[0], period_s=arm.period_s, speed_limits=arm.speed_limits
+            )
+            # the arm's end takes the time that it needs
+            with (
+                Follower(session, arm.limits.names, cell) as follower,
+                arm,
+                contextlib.closing(standstill),
+            ):
+                driving = _Driving(arm, playback, follower, cell, wait_s, say)
+                while not driving.step(stop):
+                    standstill.moves()
     except ExplainedError:
         raise
     except Exception as error:  # of the maker's library
-        raise DriveError(f"{type(arm).__name__} stopped: {error!r}") from error
+        raise DriveError(failure(error, type(arm))) from error
     return playback
 
 
@@ -89,6 +104,11 @@ class _Driving:
         arm = self._arm
         playback = self._playback
         elapsed_s = arm.wait()
+        if not (isinstance(elapsed_s, Real) and math.isfinite(elapsed_s)):
+            raise DriveError(
+                f"{type(arm).__name__}.wait gives {elapsed_s!r}; the time [s] since it was called "
+                "last needed"
+            )
         position, velocity = arm.measured()
         self._passed_s += elapsed_s
         self._publish(position, velocity)

@@ -10,6 +10,7 @@ from thirdhand.arms import DriveError, place_of
 from thirdhand.cli.usage import reaching
 from thirdhand.client import Client
 from thirdhand.client.session import tried
+from thirdhand.process import interrupt
 from thirdhand.process.own_class import explained, own_class
 from thirdhand.process.progress import say
 from thirdhand.recordings.shipped import cell_of
@@ -38,20 +39,44 @@ def follow(args: argparse.Namespace) -> int:
                 f"{', '.join(settings.joints.names)}: give the daemon's settings by --config"
             )
         kind = own_class(place, Arm)
-        with explained(args.arm):
+        with explained(kind):
             arm = kind(settings, args.robot or "")
         if arm.takes_velocity and (args.lag is not None or args.gain is not None):
             raise DriveError(f"{args.arm} follows velocities, which need neither --lag nor --gain")
-        arm.lag_s = arm.lag_s if args.lag is None else args.lag
-        arm.gain = arm.gain if args.gain is None else args.gain
+        if args.lag is not None:
+            arm.lag_s = args.lag
+        if args.gain is not None:
+            arm.gain = args.gain
         stop = threading.Event()
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, lambda *_: stop.set())
+        end = _End(stop)
         ask_for_real_time()
         say(f"driving {args.arm} by cell {cell}; Ctrl-C ends it")
-        playback = driven(arm, session, cell, stop=stop, wait_s=args.wait)
+        playback = driven(arm, session, cell, stop=stop, wait_s=args.wait, interrupt=end.interrupt)
     say(
         f"ended at rest; delay {playback.delay_ticks:.1f} ticks; {playback.refused} commands were "
         "refused"
     )
     return 0
+
+
+class _End:
+    """SIGINT and SIGTERM set `stop`; a loop that then stands still is interrupted."""
+
+    def __init__(self, stop: threading.Event) -> None:
+        self._stop = stop
+        self._interrupted = False
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._receive)
+
+    def interrupt(self) -> None:
+        """End the loop of the main thread as Ctrl-C does elsewhere; at once if it withstands."""
+        if self._interrupted:
+            interrupt.end_at_once()
+        self._interrupted = True
+        # wakes the main thread also in a call that blocks
+        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+
+    def _receive(self, *_: object) -> None:
+        self._stop.set()
+        if self._interrupted:
+            raise KeyboardInterrupt

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from thirdhand.arms import GAIN, LAG_S
 from thirdhand.cli.usage import (
     ARM_HELP,
     RATE_HELP,
@@ -40,18 +41,19 @@ def follow(add: AddCommand) -> None:
         "wam: this machine)",
     )
     lag = "what is written leads by this delay of the servo [s] (default: that of the arm's class)"
-    option(c, "--lag", "S", lag, type=within(float, 0.0, 0.5, " s"))
+    option(c, "--lag", "S", lag, type=within(float, *LAG_S, " s"))
     gain = (
         "and by the acceleration / this stiffness of the servo [1/s²] (default: that of the arm's "
         "class)"
     )
-    option(c, "--gain", "K", gain, type=within(float, 1.0, 1e6, " 1/s²"))
+    option(c, "--gain", "K", gain, type=within(float, *GAIN, " 1/s²"))
     option(
         c,
         "--wait",
         "S",
         "wait this long for the daemon, and again this long for its first command",
         60.0,
+        type=within(float, 0, 3600, " s"),
     )
     reach(c)
 

@@ -111,7 +111,7 @@ class Connection(Client, AbstractContextManager["Connection"]):
         """Publish the poses of the hands that the tracker sees now, in its frame."""
         arguments = {"left": left, "right": right}
         poses = {
-            f"hands/{side}": _pose(side, pose)
+            f"hands/{side}": checked_pose(side, pose)
             for side, pose in arguments.items()
             if pose is not None
         }
@@ -125,7 +125,7 @@ class Connection(Client, AbstractContextManager["Connection"]):
         self, pose: Sequence[float], *, stamp_ns: int | None = None, frame_id: str = BASE
     ) -> None:
         """Publish the measured pose of the tool, for demonstrations."""
-        self._publish({"tool/pose": _encoded(frame_id, *_pose("tool", pose))}, stamp_ns)
+        self._publish({"tool/pose": _encoded(frame_id, *checked_pose("tool", pose))}, stamp_ns)
 
     def gripper(self, closure: float, *, stamp_ns: int | None = None) -> None:
         """Publish the measured closure of the gripper, 0 (open) to 1 (closed), for
@@ -315,7 +315,7 @@ def _wish(
     pose: Sequence[float], std: tuple[float, float] | None, frame_id: str
 ) -> Callable[[int], bytes]:
     """The encoding of a wish for a stamp [ns]. Raises ValueError."""
-    position, orientation = _pose("wish", _numbers("wish", pose, 7))
+    position, orientation = checked_pose("wish", _numbers("wish", pose, 7))
     if std is None:
         return _encoded(frame_id, position, orientation)
     checked_frame(frame_id)
@@ -329,7 +329,7 @@ def _wish(
     )
 
 
-def _pose(what: str, pose: Sequence[float]) -> tuple[Vector3, Quaternion]:
+def checked_pose(what: str, pose: Sequence[float]) -> tuple[Vector3, Quaternion]:
     """Position [m] and orientation of a pose of three or seven numbers. Raises ValueError."""
     numbers = _numbers(what, pose, 3, 7)
     position = (numbers[0], numbers[1], numbers[2])

@@ -48,6 +48,7 @@ WATCHABLE = tuple(
 ENCODINGS = {"cdr": zenoh.Encoding.APPLICATION_CDR, "json": zenoh.Encoding.APPLICATION_JSON}
 MAX_STAMP_NS = 2**31 * 1_000_000_000  # the seconds of a message have 32 bits with a sign
 MAX_FRAME_LETTERS = 64
+FRAME = f"a name of up to {MAX_FRAME_LETTERS} printable letters, or an empty one,"
 UNTURNED: Quaternion = (0.0, 0.0, 0.0, 1.0)
 
 
@@ -154,15 +155,17 @@ def checked_stamp(stamp_ns: Any) -> int:
     return checked_ns
 
 
+def is_frame(frame_id: Any) -> bool:
+    """True for the name of a frame."""
+    return (
+        isinstance(frame_id, str) and len(frame_id) <= MAX_FRAME_LETTERS and frame_id.isprintable()
+    )
+
+
 def checked_frame(frame_id: Any) -> None:
     """Raise ValueError for what is no name of a frame."""
-    if (
-        not isinstance(frame_id, str)
-        or len(frame_id) > MAX_FRAME_LETTERS
-        or not frame_id.isprintable()
-    ):
-        needed = f"a name of up to {MAX_FRAME_LETTERS} printable letters needed, or an empty one"
-        raise ValueError(f"frame_id: {reprlib.repr(frame_id)} given; {needed}")
+    if not is_frame(frame_id):
+        raise ValueError(f"frame_id: {reprlib.repr(frame_id)} given; {FRAME} needed")
 
 
 class Tracker(AbstractContextManager["Tracker"]):

@@ -44,7 +44,7 @@ def hands(args: argparse.Namespace) -> int:
 
 def _own(args: argparse.Namespace) -> int:
     kind = own_class(args.own, Hands)
-    with reached(args, None) as session, explained(args.own):
+    with reached(args, None) as session, explained(kind):
         say(f"publishing the hands of {args.own}; Ctrl-C ends it")
         kind().publish(session, args.cell, is_over=lambda: False)
     return 0

@@ -145,6 +145,7 @@ def _check_web(args: argparse.Namespace) -> None:
         )
     if args.files != ["live"]:
         raise UsageError("--web shows a running daemon, not files: `thirdhand view live --web`")
+    web_address("--web", args.web)
 
 
 def _serve(args: argparse.Namespace, url: str) -> int:

@@ -28,7 +28,9 @@ def web_address(option: str, given: str) -> Address:
     """Host and port of `PORT` or `HOST:PORT`. Raises UsageError with the name of the option."""
     host, _, port = given.rpartition(":")
     if not port.isdecimal() or int(port) > 65535:
-        raise UsageError(f"{option} {given}: PORT or HOST:PORT needed, like 8080 or 127.0.0.1:0")
+        raise UsageError(
+            f"{option} {given}: PORT or HOST:PORT needed, like 8080 or 127.0.0.1:0, up to 65535"
+        )
     return Address(host.strip("[]") or "127.0.0.1", int(port))
 
 
