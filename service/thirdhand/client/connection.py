@@ -22,6 +22,7 @@ from thirdhand.client.streams import (
     UNTURNED,
     Publisher,
     Watch,
+    check_heard,
     checked_frame,
     checked_stamp,
     encoded_joints,
@@ -42,7 +43,9 @@ from thirdhand.contract.messages import (
 from thirdhand.contract.requests import ANSWER_TIMEOUT_S, REQUEST_NORM_TOLERANCE, Reply, ViaPoint
 
 LARGEST_STD = 1e3  # [m, rad]
-LISTENER_TIMEOUT_S = 5.0  # the first message on a channel waits this long for a subscriber
+# The first message on a channel waits this long for a subscriber. Later ones may be lost as long,
+# so that a daemon restarts without an error in a tracker.
+LISTENER_TIMEOUT_S = 5.0
 FORMS = {  # by the largest count of numbers
     1: "0 (open) to 1 (closed)",
     2: "a deviation [m] and one [rad]",
@@ -111,6 +114,7 @@ class Connection(Client, AbstractContextManager["Connection"]):
     ) -> None:
         super().__init__(session, cell, timeout_s=timeout_s)
         self._publishers: dict[str, Publisher] = {}
+        self._heard_s: dict[str, float] = {}  # by channel, when a call last found a subscriber
 
     @property
     def session(self) -> zenoh.Session:
@@ -312,6 +316,10 @@ class Connection(Client, AbstractContextManager["Connection"]):
     def _heard(self, suffix: str) -> Publisher:
         """The publisher on a channel, once somebody listens. Raises UnreachableError."""
         if (cached := self._publishers.get(suffix)) is not None:
+            if cached.is_heard:
+                self._heard_s[suffix] = time.monotonic()
+            elif time.monotonic() - self._heard_s[suffix] > LISTENER_TIMEOUT_S:
+                check_heard(cached)
             return cached
         publisher = Publisher(self._session, self._cell, suffix)
         try:
@@ -319,6 +327,7 @@ class Connection(Client, AbstractContextManager["Connection"]):
         except BaseException:
             publisher.close()
             raise
+        self._heard_s[suffix] = time.monotonic()
         return self._publishers.setdefault(suffix, publisher)
 
 

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple, Self
 import zenoh
 
 from thirdhand.client.replies import decoded
-from thirdhand.client.session import UnreachableError, check_open, tried
+from thirdhand.client.session import UnreachableError, check_open, check_process, tried
 from thirdhand.contract import cdr, channels
 from thirdhand.contract.messages import (
     BASE,
@@ -117,29 +117,34 @@ class Publisher:
 
     @property
     def is_heard(self) -> bool:
-        """True if it has a subscriber."""
-        return bool(self.zenoh.matching_status.matching)  # type: ignore[attr-defined]
+        """True if it has a subscriber. Raises UnreachableError as `put` does."""
+        try:
+            return bool(self.zenoh.matching_status.matching)  # type: ignore[attr-defined]
+        except (zenoh.ZError, RuntimeError):
+            check_open(self._session)
+            raise
 
     def close(self) -> None:
         """End the publisher."""
         self.zenoh.undeclare()  # type: ignore[no-untyped-call]
 
 
+def check_heard(*publishers: Publisher) -> None:
+    """Raise UnreachableError if one of these publishers has no subscriber."""
+    for publisher in publishers:
+        if not publisher.is_heard:
+            setting = publisher.channel.condition
+            raise UnreachableError(
+                f"nobody listens to {publisher.key}: is a daemon or `thirdhand record` running "
+                f"in this cell{setting and f', with {setting}'}?"
+            )
+
+
 def wait_until_heard(*publishers: Publisher, timeout_s: float | None) -> None:
     """Wait up to `timeout_s` [s] until each publisher has a subscriber; None: until Ctrl-C. Raises
     UnreachableError.
     """
-
-    def check() -> None:
-        for publisher in publishers:
-            if not publisher.is_heard:
-                setting = publisher.channel.condition
-                raise UnreachableError(
-                    f"nobody listens to {publisher.key}: is a daemon or `thirdhand record` running "
-                    f"in this cell{setting and f', with {setting}'}?"
-                )
-
-    tried(check, timeout_s)
+    tried(lambda: check_heard(*publishers), timeout_s)
 
 
 def checked_stamp(stamp_ns: Any) -> int:
@@ -325,6 +330,7 @@ class Watch(_Received, Iterator[Any]):
         super().__init__(session, cell, suffix)
 
     def __next__(self) -> Any:
+        check_process()
         end_s = math.inf if self._timeout_s is None else time.monotonic() + self._timeout_s
         with self._came:
             while not self._queue:
