@@ -292,8 +292,8 @@ def tried(
     """The result of `attempt`, which is repeated while it raises UnreachableError.
 
     The error is raised after `timeout_s` [s], in which no start made progress; None: never. A
-    CertificateError is raised at once. One message on standard error reports the waiting unless `silent`, which by
-    default holds if there is a timeout.
+    CertificateError is raised at once. One message on standard error reports the waiting unless
+    `silent`, which by default holds if there is a timeout.
     """
     check_process()
     begun_s = time.monotonic()

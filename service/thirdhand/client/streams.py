@@ -48,6 +48,7 @@ WATCHABLE = tuple(
 ENCODINGS = {"cdr": zenoh.Encoding.APPLICATION_CDR, "json": zenoh.Encoding.APPLICATION_JSON}
 MAX_STAMP_NS = 2**31 * 1_000_000_000  # the seconds of a message have 32 bits with a sign
 MAX_FRAME_LETTERS = 64
+LONGEST_S = 1e6  # duration that a program may give, ten days
 UNTURNED: Quaternion = (0.0, 0.0, 0.0, 1.0)
 
 
@@ -117,7 +118,7 @@ class Publisher:
 
     @property
     def is_heard(self) -> bool:
-        """True if it has a subscriber. Raises UnreachableError as `put` does."""
+        """True if it has a subscriber."""
         try:
             return bool(self.zenoh.matching_status.matching)  # type: ignore[attr-defined]
         except (zenoh.ZError, RuntimeError):
@@ -157,6 +158,18 @@ def checked_stamp(stamp_ns: Any) -> int:
         needed = "whole nanoseconds since 1970 needed, like time.time_ns()"
         raise ValueError(f"stamp_ns: {reprlib.repr(stamp_ns)} given; {needed}")
     return checked_ns
+
+
+def checked_seconds(what: str, given: Any) -> float:
+    """A duration [s]. Raises ValueError."""
+    try:
+        seconds = math.nan if isinstance(given, str | bool) else float(given)
+    except (TypeError, ValueError, OverflowError):
+        seconds = math.nan
+    if not 0.0 <= seconds <= LONGEST_S:
+        needed = f"seconds needed, 0 to {LONGEST_S:g}"
+        raise ValueError(f"{what}: {reprlib.repr(given)} given; {needed}")
+    return seconds
 
 
 def checked_frame(frame_id: Any) -> None:
@@ -326,12 +339,14 @@ class Watch(_Received, Iterator[Any]):
             raise ValueError(f"channel {suffix!r} given; one of {', '.join(WATCHABLE)} accepted")
         decode = channels.BY_KEY[suffix].codec.decode
         self._decode = functools.partial(decoded, kind=Status) if suffix == "status" else decode
-        self._timeout_s = timeout_s
+        self._timeout_s = math.inf
+        if timeout_s not in (None, math.inf):
+            self._timeout_s = checked_seconds("timeout_s", timeout_s)
         super().__init__(session, cell, suffix)
 
     def __next__(self) -> Any:
         check_process()
-        end_s = math.inf if self._timeout_s is None else time.monotonic() + self._timeout_s
+        end_s = time.monotonic() + self._timeout_s
         with self._came:
             while not self._queue:
                 if self._is_closed or self._session.is_closed():
@@ -350,7 +365,7 @@ class Watch(_Received, Iterator[Any]):
         loop = asyncio.get_running_loop()
         came = asyncio.Event()
         self._wake = functools.partial(loop.call_soon_threadsafe, came.set)
-        end_s = math.inf if self._timeout_s is None else time.monotonic() + self._timeout_s
+        end_s = time.monotonic() + self._timeout_s
         while True:
             came.clear()
             with self._came:
