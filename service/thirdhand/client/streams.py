@@ -48,7 +48,7 @@ WATCHABLE = tuple(
 ENCODINGS = {"cdr": zenoh.Encoding.APPLICATION_CDR, "json": zenoh.Encoding.APPLICATION_JSON}
 MAX_STAMP_NS = 2**31 * 1_000_000_000  # the seconds of a message have 32 bits with a sign
 MAX_FRAME_LETTERS = 64
-LONGEST_S = 1e6  # duration that a program may give, ten days
+LONGEST_WAIT_S = 1e6  # duration that a program may give, ten days
 UNTURNED: Quaternion = (0.0, 0.0, 0.0, 1.0)
 
 
@@ -119,11 +119,7 @@ class Publisher:
     @property
     def is_heard(self) -> bool:
         """True if it has a subscriber."""
-        try:
-            return bool(self.zenoh.matching_status.matching)  # type: ignore[attr-defined]
-        except (zenoh.ZError, RuntimeError):
-            check_open(self._session)
-            raise
+        return bool(self.zenoh.matching_status.matching)  # type: ignore[attr-defined]
 
     def close(self) -> None:
         """End the publisher."""
@@ -166,8 +162,8 @@ def checked_seconds(what: str, given: Any) -> float:
         seconds = math.nan if isinstance(given, str | bool) else float(given)
     except (TypeError, ValueError, OverflowError):
         seconds = math.nan
-    if not 0.0 <= seconds <= LONGEST_S:
-        needed = f"seconds needed, 0 to {LONGEST_S:g}"
+    if not 0.0 <= seconds <= LONGEST_WAIT_S:
+        needed = f"seconds needed, 0 to {LONGEST_WAIT_S:g}"
         raise ValueError(f"{what}: {reprlib.repr(given)} given; {needed}")
     return seconds
 
