@@ -452,15 +452,29 @@ def test_a_closed_connection_says_so_and_ends_its_watches(listener: zenoh.Sessio
                 call()
 
 
-def test_a_program_that_closes_nothing_ends(listener: zenoh.Session) -> None:
-    """Also where the connection is no longer known, and where an error ends the program."""
-    code = """
-import sys, thirdhand
+FORGETS = """
 def watch():
     return thirdhand.connect(sys.argv[1]).watch("tool/target", timeout_s=0.1)
 print(next(watch()), next(watch()))
-sys.exit(3)
 """
+OWN_SESSION = """
+session = thirdhand.open_session(connect=sys.argv[1:])
+print(*itertools.islice(thirdhand.Connection(session).watch("tool/target", timeout_s=0.1), 2))
+"""
+THREAD = """
+watch = thirdhand.connect(sys.argv[1]).watch("tool/target", timeout_s=0.3)
+threading.Thread(target=lambda: print(next(watch), next(watch))).start()
+"""
+AT_EXIT = """
+watch = thirdhand.connect(sys.argv[1]).watch("tool/target", timeout_s=0.1)
+atexit.register(lambda: print(next(watch), next(watch)))
+"""
+
+
+@pytest.mark.parametrize("program", [FORGETS, OWN_SESSION, THREAD, AT_EXIT])
+def test_a_program_that_closes_nothing_ends(listener: zenoh.Session, program: str) -> None:
+    """With what its threads and its calls at exit do, also where an error ends it."""
+    code = f"import atexit, itertools, sys, threading, thirdhand{program}sys.exit(3)"
     command = [sys.executable, "-c", code, *endpoints(listener)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (3, "None None\n", "")

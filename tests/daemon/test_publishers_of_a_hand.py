@@ -121,6 +121,35 @@ def test_publisher_is_heard_until_it_is_silent() -> None:
     assert sole.is_other("one", 10.0 + 3.02 * TAKEOVER_S)
 
 
+@pytest.mark.parametrize(("ahead_s", "until_s"), [(0.9, 10.9), (-0.5, 10.0), (5.0, 0), (-5.0, 0)])
+def test_publisher_of_wishes_is_heard_until_the_last_is_due(ahead_s: float, until_s: float) -> None:
+    """One whose clock is wrong, so that its wishes are rejected, keeps nobody out."""
+    sole = SolePublisher()
+    assert not sole.is_other("one", 10.0, ahead_s)
+    kept_out = until_s + TAKEOVER_S
+    assert sole.is_other("other", kept_out - 0.01) == bool(until_s)
+    assert not sole.is_other("other", max(kept_out, 10.0) + 0.01)
+
+
+def test_a_lost_hand_is_one_of_its_own_publisher(
+    cell: tuple[CellStreams, Arrivals, zenoh.Session],
+) -> None:
+    """After a tracker whose hand was lost, a program's hand may rest."""
+    streams, arrivals, session = cell
+    put = named(session)
+    until(lambda: put(sample(0.4)) or list(streams.receive()))  # until it is connected
+    for n in range(300):
+        at_ns = 10**9 + n * 10**7
+        pose = PoseStamped(at_ns, BASE, (0.41 + 1e-4 * (n % 7), 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+        received_by(streams, arrivals, put, cdr.encode_pose(pose))
+    put_other = named(session)
+    until(lambda: received_by(streams, arrivals, put_other, sample(0.8)), within_s=20 * TAKEOVER_S)
+    for n in range(200):
+        pose = PoseStamped(10**10 + n * 10**7, BASE, (0.8, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+        assert received_by(streams, arrivals, put_other, cdr.encode_pose(pose))
+    assert arrivals.frozen == 0
+
+
 def test_messages_of_every_channel_are_named() -> None:
     """A publisher numbers its messages, so that receivers can count losses."""
     with open_session(listen=["tcp/127.0.0.1:0"]) as session:

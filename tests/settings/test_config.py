@@ -474,7 +474,7 @@ def test_file_of_several_cells_holds_shared_and_own_values(tmp_path: Path) -> No
     ("text", "cell", "words"),
     [
         (LAB, "", "no cell given; FILE.toml:NAME with one of bench1, lab/bench2, bench3 needed"),
-        ("", "bench1", "cell 'bench1' given; FILE.toml:NAME with one of no cells needed"),
+        ("", "bench1", "cell 'bench1' given; the file has no tables [cells.NAME]; FILE.toml alone"),
         ("cells = 3", "a", "tables by the cells' names needed, like [cells.bench1.tool]"),
         ("[cells.a.tool]\nmax_sped = 1", "a", "max_sped"),
         ("[cells.a]\ntool = 3", "a", "tool: 3 given"),

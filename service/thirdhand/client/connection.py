@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import functools
+import atexit
 import itertools
 import math
 import reprlib
-import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from contextlib import AbstractContextManager
@@ -54,7 +53,6 @@ FORMS = {  # by the largest count of numbers
     4: "x y z w, or red, green, blue and opacity,",
     7: "x y z [m], or x y z and a quaternion x y z w,",
 }
-_OPEN: set[Connection] = set()  # what `connect` opened and nobody has closed
 
 
 def connect(
@@ -76,23 +74,8 @@ def connect(
         connect=endpoints, cell=cell, certificate=certificate, zenoh_config=zenoh_config
     )
     connection = Connection(settings.session(timeout_s=timeout_s), settings.cell)
-    _OPEN.add(connection)
-    _await_exit()
+    atexit.register(connection.close)
     return connection
-
-
-@functools.cache
-def _await_exit() -> None:
-    """Start the thread, once, that closes what is open when the main thread has ended: Python would
-    wait forever for the threads in which Zenoh receives.
-    """
-
-    def close() -> None:
-        threading.main_thread().join()
-        for connection in tuple(_OPEN):
-            connection.close()
-
-    threading.Thread(target=close).start()
 
 
 class Connection(Client, AbstractContextManager["Connection"]):
@@ -277,7 +260,7 @@ class Connection(Client, AbstractContextManager["Connection"]):
 
     def close(self) -> None:
         """Close the session, with all that was opened on it."""
-        _OPEN.discard(self)
+        atexit.unregister(self.close)
         self._session.close()  # type: ignore[no-untyped-call]
 
     def __exit__(self, *_: object) -> None:

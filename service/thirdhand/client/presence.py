@@ -11,7 +11,7 @@ from typing import NamedTuple
 import zenoh
 
 from thirdhand.client.replies import decoded
-from thirdhand.client.session import RefusedError
+from thirdhand.client.session import RefusedError, subscribed
 from thirdhand.contract import channels
 from thirdhand.contract.printable import printable
 from thirdhand.contract.requests import Status
@@ -97,7 +97,7 @@ class Overheard(AbstractContextManager["Overheard"]):
     def __init__(self, session: zenoh.Session, *expressions: str) -> None:
         self._keys: set[str] = set()
         self._subscribers = [
-            session.declare_subscriber(expression, self._take) for expression in expressions
+            subscribed(session, expression, self._take) for expression in expressions
         ]
 
     def __exit__(self, *_: object) -> None:

@@ -202,6 +202,15 @@ def check_open(session: zenoh.Session) -> None:
         raise UnreachableError("the connection was closed in this program: open a new one")
 
 
+def subscribed(
+    session: zenoh.Session, expression: str, take: Callable[[zenoh.Sample], None]
+) -> zenoh.Subscriber[None]:
+    """A subscriber that calls `take` in Zenoh's thread: Python would wait, as a program ends, for
+    the one that it makes for a plain function.
+    """
+    return session.declare_subscriber(expression, zenoh.handlers.Callback(take, indirect=False))
+
+
 def _failures(endpoints: Sequence[str]) -> dict[str, OSError]:
     """The reasons why no endpoint can be reached, by endpoint; empty if one accepts or hangs."""
     failed: dict[str, OSError] = {}

@@ -21,7 +21,13 @@ from typing import Any, NamedTuple, Self
 import zenoh
 
 from thirdhand.client.replies import decoded
-from thirdhand.client.session import UnreachableError, check_open, check_process, tried
+from thirdhand.client.session import (
+    UnreachableError,
+    check_open,
+    check_process,
+    subscribed,
+    tried,
+)
 from thirdhand.contract import cdr, channels
 from thirdhand.contract.messages import (
     BASE,
@@ -261,7 +267,7 @@ class _Received(AbstractContextManager[Any]):
         self._wake: Callable[[], object] = bool  # wakes a program that waits asynchronously
         self._queue: deque[Any] = deque(maxlen=MAX_QUEUED)
         check_open(session)
-        self._subscriber = session.declare_subscriber(channels.key(cell, suffix), self._take)
+        self._subscriber = subscribed(session, channels.key(cell, suffix), self._take)
 
     def close(self) -> None:
         """End the subscription, if that has not been done."""

@@ -139,17 +139,18 @@ class SolePublisher:
         self._name: str | None = None
         self._heard_s = 0.0
 
-    def is_other(self, name: str, now_s: float) -> bool:
-        """True if a message that came at `now_s` [s] is of another publisher than the one heard."""
+    def is_other(self, name: str, now_s: float, ahead_s: float = 0.0) -> bool:
+        """True if a message that came at `now_s` [s] is of another publisher than the one heard.
+
+        A wish that is due in `ahead_s` [s] leads until then. One that is too far ahead or late will
+        be rejected, and keeps nobody out.
+        """
         if self._name is not None and name != self._name and now_s - self._heard_s < TAKEOVER_S:
             return True
-        self._name = name
-        self._heard_s = max(now_s, self._heard_s)
+        if abs(ahead_s) <= FARTHEST_WISH_S:
+            self._name = name
+            self._heard_s = max(now_s + ahead_s, now_s, self._heard_s)
         return False
-
-    def lasts(self, until_s: float) -> None:
-        """Note that what was heard lasts until this time [s]."""
-        self._heard_s = max(self._heard_s, until_s)
 
 
 class FrozenHand:
@@ -160,7 +161,8 @@ class FrozenHand:
     the same rule to takes.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, publisher: str = "") -> None:
+        self.publisher = publisher
         self._pose: PoseStamped | None = None  # the newest pose that differs from the one before
         # distances between poses that differ, in the tracker's unit
         self._steps: deque[float] = deque(maxlen=50)
@@ -322,16 +324,19 @@ class CellStreams:
             return None
 
         # Of two publishers of a hand, only one is heard; the pose of a lost hand is not used.
+        at_ns = time.time_ns()
         sole = self._sole.get(suffix)
-        if sole is not None and sole.is_other(publisher, now_s):
+        ahead_s = 0.0
+        if suffix == TOOL_WISH and message.stamp_ns:
+            ahead_s = (message.stamp_ns - at_ns) / 1e9
+        if sole is not None and sole.is_other(publisher, now_s, ahead_s):
             arrivals.others += 1
             arrivals.count += 1
             return None
-        at_ns = time.time_ns()
-        if suffix == TOOL_WISH and sole is not None:  # a chunk leads until its end
-            sole.lasts(now_s + min((message.stamp_ns - at_ns) / 1e9, FARTHEST_WISH_S))
         arrivals.take(message, at_ns)
         hand = self._frozen.get(suffix)
+        if hand is not None and hand.publisher != publisher:
+            hand = self._frozen[suffix] = FrozenHand(publisher)
         if hand is not None and hand.is_frozen(message):
             arrivals.frozen += 1
             return None

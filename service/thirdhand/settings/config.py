@@ -763,10 +763,10 @@ def _of_cell(given: dict[str, Any], cell: str, origin: str) -> dict[str, Any]:
         return given
     if cell not in cells:
         problem = f"cell {cell!r} given" if cell else "no cell given"
-        raise SettingsError(
-            f"{origin}: {problem}; FILE.toml:NAME with one of {', '.join(cells) or 'no cells'} "
-            "needed"
-        )
+        accepted = f"FILE.toml:NAME with one of {', '.join(cells)} needed"
+        if not cells:
+            accepted = "the file has no tables [cells.NAME]; FILE.toml alone needed"
+        raise SettingsError(f"{origin}: {problem}; {accepted}")
     return _merged(given | {"cell": cell}, cells[cell])
 
 

@@ -201,7 +201,8 @@ def _not_found(recorded: PoseRecording, name: str, fitting: Sequence[PoseTopic])
     several = f"; {', '.join(map(str, fitting))} could be it" if fitting else ""
     return RecordingError(
         f"{recorded.path} has no topic ending in {TAKE_KEYS[name]} with "
-        f"{POSE.type}{also}{several}; {_poses_in(recorded)}; --{name} TOPIC[:PART] names another"
+        f"{POSE.type}{also}{several}; {_poses_in(recorded)}; --{name} TOPIC[:PART] of `thirdhand "
+        "learn` names another"
     )
 
 

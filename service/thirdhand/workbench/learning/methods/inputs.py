@@ -219,8 +219,8 @@ def _noise(count: int, alike: int) -> Iterator[str]:
     """A sentence on `alike` other kinds of inputs of some `count` takes, if these are few."""
     if count < ADVISED and alike > 0:
         yield (
-            f"with {count} demonstrations, the errors of {alike} other kinds of inputs differ from "
-            f"that of the one taken by no more than chance: record at least {ADVISED}"
+            f"with {count} demonstrations, the kind of inputs is left to chance, as the errors of "
+            f"{alike + 1} kinds are alike: record at least {ADVISED}"
         )
 
 
