@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
+import numpy as np
 import pytest
 import zenoh
 
@@ -17,6 +18,7 @@ from support.cell import until
 from support.statuses import holding
 from thirdhand.client import (
     Client,
+    Connection,
     RefusedError,
     UncertainError,
     UnreachableError,
@@ -124,6 +126,29 @@ def test_via_points_are_asked_for_as_the_wire_says(
     request = json.loads(asked[0])
     assert (request["op"], request["tolerance"]) == ("add", 0.1)
     assert request["points"][0]["left"] == [0.1, 0.2, 0.3]
+
+
+def test_points_with_numbers_of_numpy_are_taught(
+    daemon: zenoh.Session, session: zenoh.Session, answering: Callable[[str, Answer], None]
+) -> None:
+    taught: list[requests.Add] = []
+
+    def take(query: zenoh.Query) -> None:
+        assert query.payload is not None
+        taught.append(requests.decode_request(query.payload.to_bytes(), requests.Add))
+        query.reply(query.key_expr, b'{"tick": 3}')
+
+    answering("bench/via_points", take)
+    cell = Connection(session, "bench")
+    numbers: dict[str, Any] = {"std": np.float64(0.01), "radius": np.float32(0.125)}
+    numbers |= dict.fromkeys(("left", "right", "tool"), np.full(3, 0.5))
+    numbers["orientation"] = np.array([0, 0, 0, 1])
+    assert cell.teach("there", **numbers, corrections=np.int64(2)) == requests.Reply(3)
+    assert cell.add([ViaPoint("there", **numbers)]) == requests.Reply(3)
+    for request in taught:
+        assert request.points[0].left == (0.5, 0.5, 0.5)
+        assert request.points[0].orientation == (0.0, 0.0, 0.0, 1.0)
+        assert (request.points[0].std, request.points[0].radius) == (0.01, 0.125)
 
 
 def test_where_nobody_answers_the_cell_is_named(session: zenoh.Session) -> None:

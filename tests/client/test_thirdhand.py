@@ -30,6 +30,7 @@ from thirdhand.client import (
     SceneObject,
     Tracker,
     UnreachableError,
+    ViaPoint,
     Watch,
     connect,
     endpoints,
@@ -37,7 +38,7 @@ from thirdhand.client import (
 )
 from thirdhand.client.hands import ATTRIBUTES as HANDS_ATTRIBUTES
 from thirdhand.client.hands import Hands
-from thirdhand.client.streams import UNTURNED, Publisher, wait_until_heard
+from thirdhand.client.streams import MAX_STAMP_NS, UNTURNED, Publisher, wait_until_heard
 from thirdhand.contract import cdr, channels
 from thirdhand.contract.explain import ExplainedError
 from thirdhand.contract.messages import JointState, PoseStamped
@@ -204,6 +205,7 @@ def test_one_call_publishes_what_is_then_received(
         watch.close()
 
 
+AT: dict[str, Any] = dict.fromkeys(("left", "right", "tool"), (0.1, 0.2, 0.3))
 WRONG: dict[str, tuple[Callable[[Connection], object], str]] = {
     "no hand": (lambda cell: cell.hands(), "no hand given; left, right or both needed"),
     "six numbers": (lambda cell: cell.tool((0,) * 6), "tool: 6 numbers given; x y z"),
@@ -275,11 +277,75 @@ WRONG: dict[str, tuple[Callable[[Connection], object], str]] = {
     ),
     "objects that are none": (
         lambda cell: cell.objects(None),
-        "objects: None given; SceneObjects needed",
+        "objects: None given; a list needed",
     ),  # type: ignore[arg-type]
     "a point": (
         lambda cell: cell.teach("a", left=(1, 2), right=(1, 2, 3), tool=(1, 2, 3)),
         "left: 2 numbers given; x",
+    ),
+    "a deviation": (
+        lambda cell: cell.teach("a", **AT, std=np.ones(2)),
+        "std: .* given; a number from 1e-05 to 1 accepted",
+    ),
+    "a radius": (
+        lambda cell: cell.teach("a", **AT, radius=1j),
+        "radius: '1j' given; a number from 0 to 0.2 accepted",
+    ),
+    "a direction": (
+        lambda cell: cell.teach("a", **AT, orientation=5),
+        "orientation: 5 given; 4 numbers needed",
+    ),
+    "a field": (lambda cell: cell.teach("a", **AT, stdd=1), "stdd.*did you mean std"),
+    "a lone point": (
+        lambda cell: cell.add(ViaPoint("a", **AT)),  # type: ignore[arg-type]
+        "points: ViaPoint.* given; a list of ViaPoints needed",
+    ),
+    "a point in a dict": (
+        lambda cell: cell.add([{"name": "a"}]),  # type: ignore[list-item]
+        r"points: \[{'name': 'a'}\] given; a list of ViaPoints",
+    ),
+    "a joint switched on": (lambda cell: cell.joints(["a"], [True]), "finite numbers needed"),
+    "a short position": (
+        lambda cell: cell.objects([BOX._replace(position=(0, 0))]),  # type: ignore[arg-type]
+        "object 'board': position: 2 numbers given; x y z",
+    ),
+    "a long colour": (
+        lambda cell: cell.objects([BOX._replace(colour=(1e300, 0, 0, 1))]),
+        "object 'board': a colour of red, green",
+    ),
+    "an object by number": (
+        lambda cell: cell.objects([BOX._replace(name=5)]),  # type: ignore[arg-type]
+        "object 5 given; a text as its name needed",
+    ),
+    "no shape": (
+        lambda cell: cell.objects([BOX._replace(shape=[])]),  # type: ignore[arg-type]
+        r"shape \[\] given; one of box",
+    ),
+    "a step in words": (
+        lambda cell: cell.wish_chunk([TURNED], step_s="0.1"),  # type: ignore[arg-type]
+        "step_s: '0.1' given; seconds needed",
+    ),
+    "a long step": (
+        lambda cell: cell.wish_chunk([TURNED], step_s=1e300),
+        r"step_s: 1e\+300 given; seconds needed, 0 to 1e\+06",
+    ),
+    "no step": (lambda cell: cell.wish_chunk([TURNED], step_s=0), "step_s: 0 given; a duration"),
+    "a chunk beyond 2038": (
+        lambda cell: cell.wish_chunk([TURNED] * 2, step_s=1, stamp_ns=MAX_STAMP_NS - 1),
+        "stamp_ns: .* given; whole nanoseconds",
+    ),
+    "no wish": (lambda cell: cell.wish_chunk([], step_s=0.1), "poses: none given; at least one"),
+    "a wish alone": (
+        lambda cell: cell.wish_chunk(5, step_s=0.1),  # type: ignore[arg-type]
+        "poses: 5 given; a list needed",
+    ),
+    "a wait in words": (
+        lambda cell: cell.watch("status", timeout_s="1"),  # type: ignore[arg-type]
+        "timeout_s: '1' given; seconds needed",
+    ),
+    "an unknown request": (
+        lambda cell: cell.ask("nothing"),
+        "request 'nothing' given; one of status, via_points, .* accepted",
     ),
 }
 
@@ -289,6 +355,7 @@ POSES: dict[str, tuple[Any, str]] = {
     "one number": (5, "left: 5 given; x y z"),
     "digits": ("123", "left: '123' given; x y z"),
     "texts of digits": (["1", "2", "3"], "left: .* given; x y z"),
+    "a switch": ((True, 0, 0), "left: .* given; x y z"),
     "without order": ({1.0, 2.0, 3.0}, "left: .* given; x y z"),
     "by name": ({1: 1, 2: 2, 3: 3}, "left: .* given; x y z"),
     "too large": ([10**400, 0, 0], "left: .* given; x y z"),

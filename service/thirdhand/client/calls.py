@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import reprlib
 import time
 from collections.abc import Iterable
 from typing import Any, Literal, TypeVar
 
+import msgspec
 import zenoh
 
 from thirdhand.client.presence import is_connected, living, why_silent
@@ -20,6 +22,7 @@ from thirdhand.client.session import (
     tried,
 )
 from thirdhand.contract import channels, requests
+from thirdhand.contract.explain import in_file
 from thirdhand.contract.messages import Vector3
 from thirdhand.contract.printable import printable_lines
 from thirdhand.contract.requests import ANSWER_TIMEOUT_S, Reply, Status, ViaPoint, ViaPointInForce
@@ -29,6 +32,7 @@ OLD_REPLY = " A Zenoh storage answered with an old reply, but no daemon of this 
 QUERIES = 2  # queries within the time of one request, if it may be repeated
 # a connection that broke returns within this time, unless the network or the daemon is down
 RECONNECTED_S = 2.0
+REQUESTS = tuple(channel.key for channel in channels.CHANNELS if channel.queryable)
 LIST = requests.encode_json(requests.List())
 Answer = TypeVar("Answer")
 
@@ -94,7 +98,7 @@ class Client:
 
         They replace learned points of the skill that are nearer than `tolerance` [m].
         """
-        return self._typed("via_points", requests.Add(tuple(points), tolerance), Reply)
+        return self._typed("via_points", requests.Add(_via_points(points), tolerance), Reply)
 
     def remove(self, *names: str) -> Reply:
         """Remove via-points by name, all or nothing; returns once that is in force."""
@@ -129,6 +133,8 @@ class Client:
 
     def ask(self, suffix: str, request: Any = None) -> dict[str, Any]:
         """The reply to one request as received; `request` is anything that JSON can encode."""
+        if suffix not in REQUESTS:
+            raise ValueError(f"request {suffix!r} given; one of {', '.join(REQUESTS)} accepted")
         answer: dict[str, Any] = decoded(self._answer(suffix, request), dict)
         return answer
 
@@ -241,9 +247,32 @@ class Client:
         return channels.key(self._cell, suffix)
 
 
+def via_point(fields: dict[str, Any]) -> ViaPoint:
+    """A via-point from its fields, with numbers and arrays of NumPy too. Raises RefusedError."""
+    point: ViaPoint
+    try:
+        point = requests.decode_request(_encoded(fields), ViaPoint)
+    except requests.RequestError as error:
+        raise RefusedError(in_file(str(error))) from None
+    return point
+
+
+def _via_points(points: Any) -> tuple[ViaPoint, ...]:
+    """The via-points that were given. Raises ValueError."""
+    given = tuple(points) if isinstance(points, Iterable) else (None,)
+    if not all(isinstance(point, ViaPoint) for point in given):
+        raise ValueError(f"points: {reprlib.repr(points)} given; a list of ViaPoints needed")
+    return given
+
+
+def _plain(value: Any) -> Any:
+    """A number or an array of NumPy as Python's own; else a text, which is refused in its place."""
+    return value.tolist() if hasattr(value, "tolist") else reprlib.repr(value)
+
+
 def _encoded(request: Any) -> bytes:
     """A request in JSON. Raises RefusedError if it is too large."""
-    payload = requests.encode_json({} if request is None else request)
+    payload = msgspec.json.encode({} if request is None else request, enc_hook=_plain)
     if len(payload) > channels.LARGEST_REQUEST:
         raise RefusedError(
             f"a request of {len(payload)} bytes, at most {channels.LARGEST_REQUEST} accepted"

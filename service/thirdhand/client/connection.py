@@ -14,14 +14,16 @@ from typing import Any
 
 import zenoh
 
-from thirdhand.client.calls import Client
+from thirdhand.client.calls import Client, via_point
 from thirdhand.client.client_settings import client_settings
 from thirdhand.client.session import check_open
 from thirdhand.client.streams import (
     UNTURNED,
     Publisher,
     Watch,
+    check_heard,
     checked_frame,
+    checked_seconds,
     checked_stamp,
     encoded_joints,
     wait_until_heard,
@@ -38,14 +40,17 @@ from thirdhand.contract.messages import (
     Vector3,
     finite,
 )
-from thirdhand.contract.requests import ANSWER_TIMEOUT_S, REQUEST_NORM_TOLERANCE, Reply, ViaPoint
+from thirdhand.contract.requests import ANSWER_TIMEOUT_S, REQUEST_NORM_TOLERANCE, Reply
 
 LARGEST_STD = 1e3  # [m, rad]
-LISTENER_TIMEOUT_S = 5.0  # the first message on a channel waits this long for a subscriber
+# The first message on a channel waits this long for a subscriber. Later ones may be lost as long,
+# so that a daemon restarts without an error in a tracker.
+LISTENER_TIMEOUT_S = 5.0
 FORMS = {  # by the largest count of numbers
     1: "0 (open) to 1 (closed)",
     2: "a deviation [m] and one [rad]",
     3: "x y z [m]",
+    4: "x y z w, or red, green, blue and opacity,",
     7: "x y z [m], or x y z and a quaternion x y z w,",
 }
 
@@ -81,8 +86,9 @@ class Connection(Client, AbstractContextManager["Connection"]):
     increase. The first message on a channel waits up to 5 s until somebody listens to it. `close`
     closes the session.
 
-    Each publishing call raises ValueError, before anything is sent, for values that the service
-    would reject, and UnreachableError if nobody listens.
+    Each publishing call raises ValueError, before anything is sent, for values of another form or
+    not finite; the daemon checks frame, distance and time. It raises UnreachableError if nobody
+    listens, nor did in a call of the last 5 s: a daemon may restart.
     """
 
     def __init__(
@@ -94,6 +100,7 @@ class Connection(Client, AbstractContextManager["Connection"]):
     ) -> None:
         super().__init__(session, cell, timeout_s=timeout_s)
         self._publishers: dict[str, Publisher] = {}
+        self._heard_s: dict[str, float] = {}  # by channel, when a call last found a subscriber
 
     @property
     def session(self) -> zenoh.Session:
@@ -151,7 +158,8 @@ class Connection(Client, AbstractContextManager["Connection"]):
         that a program of its own moves. An arm that follows this cell uses a `Follower`.
         """
         encoded_joints(0, names, position, velocity)  # raises before anything is sent
-        if not finite((*position, *velocity)):
+        numbers = (*position, *velocity)
+        if not finite(numbers) or any(isinstance(number, bool) for number in numbers):
             raise ValueError(
                 f"joints: {list(position)} and {list(velocity)} given; finite numbers needed"
             )
@@ -197,33 +205,27 @@ class Connection(Client, AbstractContextManager["Connection"]):
         observation. It takes the place of an earlier chunk as long as it lasts; what that one has
         for later stays.
         """
-        chunk = [_wish(pose, std, frame_id) for pose in poses]
-        if not 0.0 < step_s < math.inf:
+        chunk = [_wish(pose, std, frame_id) for pose in _listed("poses", poses)]
+        if not chunk:
+            raise ValueError("poses: none given; at least one needed")
+        step_ns = 1e9 * checked_seconds("step_s", step_s)
+        if not step_ns:
             raise ValueError(f"step_s: {step_s!r} given; a duration above 0 s needed")
-        if not stamp_ns:
+        if stamp_ns:
+            checked_stamp(checked_stamp(stamp_ns) + round((len(chunk) - 1) * step_ns))
+        else:
+            check_open(self._session)
             self._heard("tool/wish")
             stamp_ns = time.time_ns()
         for i, encode in enumerate(chunk):
-            self._publish({"tool/wish": encode}, stamp_ns + round(i * step_s * 1e9))
+            self._publish({"tool/wish": encode}, stamp_ns + round(i * step_ns))
 
     def objects(self, objects: Iterable[SceneObject], *, stamp_ns: int | None = None) -> None:
         """Publish all objects on the bench, for viewers and recordings."""
-        try:
-            scene = tuple(objects)
-        except TypeError:
-            raise ValueError(
-                f"objects: {reprlib.repr(objects)} given; SceneObjects needed"
-            ) from None
+        scene = _listed("objects", objects)
         for scene_object in scene:
-            if not isinstance(scene_object, SceneObject):
-                raise ValueError(f"object {scene_object!r} given; a SceneObject needed")
-            if scene_object.shape not in markers.NUMBERS:
-                accepted = ", ".join(markers.NUMBERS)
-                raise ValueError(
-                    f"object {scene_object.name!r}: shape {scene_object.shape!r} given; one of "
-                    f"{accepted} accepted"
-                )
-        # raises the error that the daemon would report
+            _check_object(scene_object)
+        # raises the error that the daemon would report of all together
         markers.decode_objects(markers.encode_objects(0, scene))
         self._publish({"objects": lambda ns: markers.encode_objects(ns, scene)}, stamp_ns)
 
@@ -247,14 +249,14 @@ class Connection(Client, AbstractContextManager["Connection"]):
         """Teach one via-point: the tool's position [m] that belongs to these positions of the
         hands. `more` are further fields of `ViaPoint`. Returns once it is in force.
         """
-        point = ViaPoint(
-            name,
-            _position("left", left),
-            _position("right", right),
-            _position("tool", tool),
+        fields = {
+            "name": name,
+            "left": _numbers("left", left, 3),
+            "right": _numbers("right", right, 3),
+            "tool": _numbers("tool", tool, 3),
             **more,
-        )
-        return self.add([point])
+        }
+        return self.add([via_point(fields)])
 
     def close(self) -> None:
         """Close the session, with all that was opened on it."""
@@ -295,6 +297,10 @@ class Connection(Client, AbstractContextManager["Connection"]):
     def _heard(self, suffix: str) -> Publisher:
         """The publisher on a channel, once somebody listens. Raises UnreachableError."""
         if (cached := self._publishers.get(suffix)) is not None:
+            if cached.is_heard:
+                self._heard_s[suffix] = time.monotonic()
+            elif time.monotonic() - self._heard_s[suffix] > LISTENER_TIMEOUT_S:
+                check_heard(cached)
             return cached
         publisher = Publisher(self._session, self._cell, suffix)
         try:
@@ -302,7 +308,34 @@ class Connection(Client, AbstractContextManager["Connection"]):
         except BaseException:
             publisher.close()
             raise
+        self._heard_s[suffix] = time.monotonic()
         return self._publishers.setdefault(suffix, publisher)
+
+
+def _listed(what: str, given: Iterable[Any]) -> tuple[Any, ...]:
+    """The members of what was given. Raises ValueError."""
+    try:
+        return tuple(given)
+    except TypeError:
+        raise ValueError(f"{what}: {reprlib.repr(given)} given; a list needed") from None
+
+
+def _check_object(scene_object: Any) -> None:
+    """Raise ValueError for what cannot be encoded as an object."""
+    if not isinstance(scene_object, SceneObject):
+        raise ValueError(f"object {scene_object!r} given; a SceneObject needed")
+    what = f"object {reprlib.repr(scene_object.name)}"
+    if not isinstance(scene_object.name, str):
+        raise ValueError(f"{what} given; a text as its name needed")
+    if scene_object.shape not in tuple(markers.NUMBERS):
+        accepted = ", ".join(markers.NUMBERS)
+        raise ValueError(f"{what}: shape {scene_object.shape!r} given; one of {accepted} accepted")
+    checked_frame(scene_object.frame_id)
+    _numbers(f"{what}: position", scene_object.position, 3)
+    _numbers(f"{what}: orientation", scene_object.orientation, 4)
+    _numbers(f"{what}: size", scene_object.size, 3)
+    _numbers(f"{what}: colour", scene_object.colour, 4)
+    markers.checked(scene_object)
 
 
 def _encoded(frame_id: str, position: Vector3, orientation: Quaternion) -> Callable[[int], bytes]:
@@ -343,12 +376,6 @@ def checked_pose(what: str, pose: Sequence[float]) -> tuple[Vector3, Quaternion]
     return position, (turned[0], turned[1], turned[2], turned[3])
 
 
-def _position(what: str, given: Sequence[float]) -> Vector3:
-    """The three numbers of a position [m]. Raises ValueError."""
-    x, y, z = _numbers(what, given, 3)
-    return x, y, z
-
-
 def _numbers(what: str, given: Sequence[float], *counts: int) -> tuple[float, ...]:
     """The finite numbers in a sequence of one of these lengths. Raises ValueError."""
     try:
@@ -356,7 +383,7 @@ def _numbers(what: str, given: Sequence[float], *counts: int) -> tuple[float, ..
         if isinstance(given, str | bytes | bytearray | Mapping | Set):
             raise TypeError
         values = tuple(itertools.islice(given, counts[-1] + 1))
-        if any(isinstance(value, str | bytes) for value in values):
+        if any(isinstance(value, str | bytes | bool) for value in values):
             raise TypeError
         numbers = tuple(map(float, values))
     except (TypeError, ValueError, OverflowError):

@@ -57,6 +57,7 @@ FIXED_SETTINGS: dict[str, Any] = {  # of Zenoh, for every session
     # it is not faster here, and it bypasses the bounds on messages
     "transport/shared_memory/enabled": False,
 }
+_zenoh_pids: set[int] = set()  # this process once Zenoh runs threads in it; a fork has none
 Attempted = TypeVar("Attempted")
 
 
@@ -124,7 +125,7 @@ def open_session(
                 _check_certificates(connect, folder)
             raise UnreachableError(_why_not(str(error).split(" at ")[0], connect, listen)) from None
 
-    return tried(opened, None if timeout_s is None and not listen else 0.0)
+    return tried(opened, 0.0 if listen else timeout_s)
 
 
 def _settings(
@@ -134,12 +135,15 @@ def _settings(
     role = "client" if connect else "peer"
     if connect and listen:
         role = "router"
+    attempt_s = ATTEMPT_S if timeout_s is None else timeout_s
+    if not listen:
+        attempt_s = min(attempt_s, ATTEMPT_S)  # Python notices Ctrl-C only between attempts
     return {
         **FIXED_SETTINGS,
         "mode": json.loads(config.get_json("mode")) or role,
         "listen/endpoints": list(listen),
         "connect/endpoints": list(connect),
-        "connect/timeout_ms": int(1000 * (ATTEMPT_S if timeout_s is None else timeout_s)),
+        "connect/timeout_ms": int(1000 * attempt_s),
         "adminspace": {"enabled": bool(listen), "permissions": {"read": True, "write": False}},
     }
 
@@ -148,6 +152,7 @@ def _opened(config: zenoh.Config, settings: Mapping[str, Any]) -> zenoh.Session:
     """An open session with these settings. Raises zenoh.ZError."""
     for name, value in settings.items():
         config.insert_json5(name, json.dumps(value))
+    _zenoh_pids.add(os.getpid())
     return zenoh.open(config)
 
 
@@ -175,8 +180,20 @@ def _check_certificates(connect: Sequence[str], folder: str | Path | None) -> No
             raise CertificateError(problem) from None
 
 
+def check_process() -> None:
+    """Raise UnreachableError in a fork of a process that had opened a session: it would hang."""
+    if _zenoh_pids and os.getpid() not in _zenoh_pids:
+        raise UnreachableError(
+            "this process was forked after a connection had been opened, so none works here: "
+            'start it by multiprocessing.get_context("spawn"), or before the first connection'
+        )
+
+
 def check_open(session: zenoh.Session) -> None:
-    """Raise UnreachableError for a session that was closed, or that another thread closes."""
+    """Raise UnreachableError for a session that was closed, or that another thread closes, and in a
+    fork.
+    """
+    check_process()
     try:
         closed = session.is_closed()
     except RuntimeError:  # Zenoh has lent the session to the thread that closes it
@@ -283,10 +300,11 @@ def tried(
 ) -> Attempted:
     """The result of `attempt`, which is repeated while it raises UnreachableError.
 
-    The error is raised after `timeout_s` [s] with the same message; None: never. A CertificateError
-    is raised at once. One message on standard error reports the waiting unless `silent`, which by
-    default holds if there is a timeout.
+    The error is raised after `timeout_s` [s], in which no start made progress; None: never. A
+    CertificateError is raised at once. One message on standard error reports the waiting unless
+    `silent`, which by default holds if there is a timeout.
     """
+    check_process()
     begun_s = time.monotonic()
     reported = ""
     silent = timeout_s is not None if silent is None else silent
@@ -296,7 +314,7 @@ def tried(
         except CertificateError:
             raise
         except UnreachableError as error:
-            if reported and str(error) != reported:
+            if isinstance(error, StartingError) and str(error) != reported:
                 begun_s = time.monotonic()
             reported = str(error)
             waited_s = time.monotonic() - begun_s

@@ -21,7 +21,13 @@ from typing import Any, NamedTuple, Self
 import zenoh
 
 from thirdhand.client.replies import decoded
-from thirdhand.client.session import UnreachableError, check_open, subscribed, tried
+from thirdhand.client.session import (
+    UnreachableError,
+    check_open,
+    check_process,
+    subscribed,
+    tried,
+)
 from thirdhand.contract import cdr, channels
 from thirdhand.contract.messages import (
     BASE,
@@ -49,6 +55,7 @@ ENCODINGS = {"cdr": zenoh.Encoding.APPLICATION_CDR, "json": zenoh.Encoding.APPLI
 MAX_STAMP_NS = 2**31 * 1_000_000_000  # the seconds of a message have 32 bits with a sign
 MAX_FRAME_LETTERS = 64
 FRAME = f"a name of up to {MAX_FRAME_LETTERS} printable letters, or an empty one,"
+LONGEST_WAIT_S = 1e6  # duration that a program may give, ten days
 UNTURNED: Quaternion = (0.0, 0.0, 0.0, 1.0)
 
 
@@ -126,21 +133,22 @@ class Publisher:
         self.zenoh.undeclare()  # type: ignore[no-untyped-call]
 
 
+def check_heard(*publishers: Publisher) -> None:
+    """Raise UnreachableError if one of these publishers has no subscriber."""
+    for publisher in publishers:
+        if not publisher.is_heard:
+            setting = publisher.channel.condition
+            raise UnreachableError(
+                f"nobody listens to {publisher.key}: is a daemon or `thirdhand record` running "
+                f"in this cell{setting and f', with {setting}'}?"
+            )
+
+
 def wait_until_heard(*publishers: Publisher, timeout_s: float | None) -> None:
     """Wait up to `timeout_s` [s] until each publisher has a subscriber; None: until Ctrl-C. Raises
     UnreachableError.
     """
-
-    def check() -> None:
-        for publisher in publishers:
-            if not publisher.is_heard:
-                setting = publisher.channel.condition
-                raise UnreachableError(
-                    f"nobody listens to {publisher.key}: is a daemon or `thirdhand record` running "
-                    f"in this cell{setting and f', with {setting}'}?"
-                )
-
-    tried(check, timeout_s)
+    tried(lambda: check_heard(*publishers), timeout_s)
 
 
 def checked_stamp(stamp_ns: Any) -> int:
@@ -160,6 +168,18 @@ def is_frame(frame_id: Any) -> bool:
     return (
         isinstance(frame_id, str) and len(frame_id) <= MAX_FRAME_LETTERS and frame_id.isprintable()
     )
+
+
+def checked_seconds(what: str, given: Any) -> float:
+    """A duration [s]. Raises ValueError."""
+    try:
+        seconds = math.nan if isinstance(given, str | bool) else float(given)
+    except (TypeError, ValueError, OverflowError):
+        seconds = math.nan
+    if not 0.0 <= seconds <= LONGEST_WAIT_S:
+        needed = f"seconds needed, 0 to {LONGEST_WAIT_S:g}"
+        raise ValueError(f"{what}: {reprlib.repr(given)} given; {needed}")
+    return seconds
 
 
 def checked_frame(frame_id: Any) -> None:
@@ -324,11 +344,14 @@ class Watch(_Received, Iterator[Any]):
             raise ValueError(f"channel {suffix!r} given; one of {', '.join(WATCHABLE)} accepted")
         decode = channels.BY_KEY[suffix].codec.decode
         self._decode = functools.partial(decoded, kind=Status) if suffix == "status" else decode
-        self._timeout_s = timeout_s
+        self._timeout_s = math.inf
+        if timeout_s not in (None, math.inf):
+            self._timeout_s = checked_seconds("timeout_s", timeout_s)
         super().__init__(session, cell, suffix)
 
     def __next__(self) -> Any:
-        end_s = math.inf if self._timeout_s is None else time.monotonic() + self._timeout_s
+        check_process()
+        end_s = time.monotonic() + self._timeout_s
         with self._came:
             while not self._queue:
                 if self._is_closed or self._session.is_closed():
@@ -347,7 +370,7 @@ class Watch(_Received, Iterator[Any]):
         loop = asyncio.get_running_loop()
         came = asyncio.Event()
         self._wake = functools.partial(loop.call_soon_threadsafe, came.set)
-        end_s = math.inf if self._timeout_s is None else time.monotonic() + self._timeout_s
+        end_s = time.monotonic() + self._timeout_s
         while True:
             came.clear()
             with self._came:

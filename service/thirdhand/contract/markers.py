@@ -85,7 +85,7 @@ def decode_objects(data: bytes) -> tuple[SceneObject, ...]:
         reader.unpack(_BYTE, 1)
         if action == _ADD and kind in SHAPES:
             objects.append(
-                _checked(
+                checked(
                     SceneObject(
                         name, SHAPES[kind], frame, placed[:3], placed[3:7], placed[7:], colour
                     )
@@ -101,7 +101,8 @@ def decode_objects(data: bytes) -> tuple[SceneObject, ...]:
     return tuple(objects)
 
 
-def _checked(one: SceneObject) -> SceneObject:
+def checked(one: SceneObject) -> SceneObject:
+    """The object, if viewers can draw it. Raises WireError."""
     numbers = (*one.position, *one.size)
     if (
         not all(math.isfinite(value) and abs(value) <= LARGEST_M for value in numbers)
