@@ -88,7 +88,7 @@ class Connection(Client, AbstractContextManager["Connection"]):
 
     Each publishing call raises ValueError, before anything is sent, for values of another form or
     not finite; the daemon checks frame, distance and time. It raises UnreachableError if nobody
-    listens, nor did in a call of the last 5 s: a daemon may restart.
+    listens, nor did in a call of the last 5 s.
     """
 
     def __init__(
