@@ -24,7 +24,10 @@ from kmp.low_rank import LowRank
 from kmp.problem.database import Database
 from kmp.solution import mean_of
 
-_LEAST = 1e-7  # least singular value / k(s, s) of a goal's system: errors are 4e-16 over it
+# least singular value / k(s, s) of a goal's system: errors are 4e-16 over it
+_LEAST_SINGULAR = 1e-7
+    1e-7  # least singular value / k(s, s) of a goal's system: errors are 4e-16 over it
+)
 
 
 def moved_means(
@@ -63,7 +66,7 @@ def moved_means(
         system = system.reshape(len(mine), size, size)
         pulls = np.linalg.solve(system, errors[rows].reshape(len(mine), size, 1))
         least = np.linalg.svdvals(system)[:, -1]
-        pulls[least < _LEAST * posterior.largest] = np.nan
+        pulls[least < _LEAST_SINGULAR * posterior.largest] = np.nan
         moves[mine] = posterior.across(rows, roots, pulls.reshape(*rows.shape, outputs))
     return moves
 

@@ -553,9 +553,17 @@ AT_EXIT = """
 watch = thirdhand.connect(sys.argv[1]).watch("tool/target", timeout_s=0.1)
 atexit.register(lambda: print(next(watch), next(watch)))
 """
+FORK = """
+import os
+watch = thirdhand.connect(sys.argv[1]).watch("tool/target", timeout_s=0.1)
+if not os.fork():
+    sys.exit(0)
+os.wait()
+print(next(watch), next(watch))
+"""
 
 
-@pytest.mark.parametrize("program", [FORGETS, OWN_SESSION, THREAD, AT_EXIT])
+@pytest.mark.parametrize("program", [FORGETS, OWN_SESSION, THREAD, AT_EXIT, FORK])
 def test_a_program_that_closes_nothing_ends(listener: zenoh.Session, program: str) -> None:
     """With what its threads and its calls at exit do, also where an error ends it."""
     code = f"import atexit, itertools, sys, threading, thirdhand{program}sys.exit(3)"

@@ -16,7 +16,7 @@ import zenoh
 
 from thirdhand.client.calls import Client, via_point
 from thirdhand.client.client_settings import client_settings
-from thirdhand.client.session import check_open
+from thirdhand.client.session import check_open, is_forked
 from thirdhand.client.streams import (
     UNTURNED,
     Publisher,
@@ -261,7 +261,8 @@ class Connection(Client, AbstractContextManager["Connection"]):
     def close(self) -> None:
         """Close the session, with all that was opened on it."""
         atexit.unregister(self.close)
-        self._session.close()  # type: ignore[no-untyped-call]
+        if not is_forked():
+            self._session.close()  # type: ignore[no-untyped-call]
 
     def __exit__(self, *_: object) -> None:
         self.close()

@@ -180,9 +180,14 @@ def _check_certificates(connect: Sequence[str], folder: str | Path | None) -> No
             raise CertificateError(problem) from None
 
 
+def is_forked() -> bool:
+    """True in a fork of a process that had opened a session: there, all of Zenoh hangs."""
+    return bool(_zenoh_pids) and os.getpid() not in _zenoh_pids
+
+
 def check_process() -> None:
-    """Raise UnreachableError in a fork of a process that had opened a session: it would hang."""
-    if _zenoh_pids and os.getpid() not in _zenoh_pids:
+    """Raise UnreachableError in such a fork."""
+    if is_forked():
         raise UnreachableError(
             "this process was forked after a connection had been opened, so none works here: "
             'start it by multiprocessing.get_context("spawn"), or before the first connection'
