@@ -26,8 +26,6 @@ from kmp.solution import mean_of
 
 # least singular value / k(s, s) of a goal's system: errors are 4e-16 over it
 _LEAST_SINGULAR = 1e-7
-    1e-7  # least singular value / k(s, s) of a goal's system: errors are 4e-16 over it
-)
 
 
 def moved_means(

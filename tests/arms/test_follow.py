@@ -26,7 +26,7 @@ from support.cell import LEFT, Tracker, serving, thirdhand, told, until
 from support.franka_cell import assert_allowed, franka_toml, robot, simulated
 from support.paths import ROOT
 from thirdhand.arms import place_of
-from thirdhand.arms.arm import ATTRIBUTES, Arm
+from thirdhand.arms.arm import ARM_ATTRIBUTES, Arm
 from thirdhand.arms.drive import follow
 from thirdhand.arms.simulated import SimulatedArm
 from thirdhand.client import UnreachableError, endpoints, open_session
@@ -350,9 +350,9 @@ def test_where_no_command_comes_that_is_told_and_the_arm_stays() -> None:
 
 
 @pytest.mark.parametrize("value", [-1, 0, 20, math.nan, "0.1", None, True, print])
-@pytest.mark.parametrize("name", ATTRIBUTES)
+@pytest.mark.parametrize("name", ARM_ATTRIBUTES)
 def test_attributes_of_a_class_are_checked(name: str, value: object) -> None:
-    is_accepted, needed = ATTRIBUTES[name]
+    is_accepted, needed = ARM_ATTRIBUTES[name]
     accepted = {
         **dict.fromkeys(("takes_velocity", "guided"), (True,)),
         "speed_limits": (None, print),
@@ -370,7 +370,7 @@ def test_attributes_of_a_class_are_checked(name: str, value: object) -> None:
 
 
 def test_each_attribute_of_an_arm_has_a_check() -> None:
-    assert ATTRIBUTES.keys() == Arm.__annotations__.keys()
+    assert ARM_ATTRIBUTES.keys() == Arm.__annotations__.keys()
 
 
 @given(

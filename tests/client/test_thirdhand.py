@@ -36,8 +36,7 @@ from thirdhand.client import (
     endpoints,
     open_session,
 )
-from thirdhand.client.hands import ATTRIBUTES as HANDS_ATTRIBUTES
-from thirdhand.client.hands import Hands
+from thirdhand.client.hands import HANDS_ATTRIBUTES, Hands
 from thirdhand.client.streams import MAX_STAMP_NS, UNTURNED, Publisher, wait_until_heard
 from thirdhand.contract import cdr, channels
 from thirdhand.contract.explain import ExplainedError

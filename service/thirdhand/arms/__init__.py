@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from thirdhand.contract.explain import ExplainedError
 
-PERIOD_S = (0.0005, 0.02)
+DRIVE_PERIOD_S = (0.0005, 0.02)
 LAG_S = (0.0, 0.5)
 GAIN = (1.0, 1e6)  # [1/s²]
 GROUP = "thirdhand.arms"  # of the entry points with which other distributions name their arms

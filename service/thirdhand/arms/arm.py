@@ -12,7 +12,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from thirdhand.arms import GAIN, LAG_S, PERIOD_S, DriveError
+from thirdhand.arms import DRIVE_PERIOD_S, GAIN, LAG_S, DriveError
 from thirdhand.arms.playback import SpeedLimits
 from thirdhand.core.frame import Vector
 from thirdhand.core.limiter.stage import Limited
@@ -21,8 +21,8 @@ from thirdhand.settings.config import Settings
 
 MAX_BEHIND_S = 0.05  # a loop that is later than this does not make up for its delay
 IS_BOOL: Accepted = (lambda value: isinstance(value, bool | np.bool_), "True or False")
-ATTRIBUTES: Mapping[str, Accepted] = {
-    "period_s": number(*PERIOD_S, " s"),
+ARM_ATTRIBUTES: Mapping[str, Accepted] = {
+    "period_s": number(*DRIVE_PERIOD_S, " s"),
     "lag_s": number(*LAG_S, " s"),
     "gain": number(*GAIN, " 1/s²", math.inf),
     "takes_velocity": IS_BOOL,
@@ -67,7 +67,7 @@ class Arm(AbstractContextManager["Arm"]):
 
     def check(self) -> None:
         """Raise ExplainedError for a class that cannot be driven."""
-        check_attributes(self, ATTRIBUTES)
+        check_attributes(self, ARM_ATTRIBUTES)
         if not hasattr(self, "limits"):
             raise DriveError(
                 f"{type(self).__name__}.__init__ does not call "
@@ -126,19 +126,19 @@ class Arm(AbstractContextManager["Arm"]):
         if not np.isfinite(ahead).all():
             raise DriveError(
                 f"{type(self).__name__}: lag_s {self.lag_s} and gain {self.gain} given; "
-                f"{ATTRIBUTES['lag_s'][1]} and {ATTRIBUTES['gain'][1]} needed"
+                f"{ARM_ATTRIBUTES['lag_s'][1]} and {ARM_ATTRIBUTES['gain'][1]} needed"
             )
 
         # motion and lead together keep the speed limits, except where the arm was led by hand
         before = position if self._position is None else self._position
         max_step = np.array(self.limits.velocity) * self.period_s
-        step = np.clip(position - before, -max_step, max_step)
-        ahead = np.clip(ahead - self._ahead, -max_step - step, max_step - step) + self._ahead
+        step = (position - before).clip(-max_step, max_step)
+        ahead = (ahead - self._ahead).clip(-max_step - step, max_step - step) + self._ahead
 
         # an arm that stands outside its limits does not jump into them
         lower = np.minimum(self.limits.lower, position)
         upper = np.maximum(self.limits.upper, position)
-        written = np.clip(position + ahead, lower, upper)
+        written = (position + ahead).clip(lower, upper)
         self._position = position
         self._ahead = written - position
         self.write(written, moved.velocity, moved.acceleration)

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from thirdhand.process.own_class import own_lines
 
 STANDS_S = 2.0  # a loop stands still if no period ends within this time
-POLL_S = 0.1
+LOOK_EVERY_S = 0.1
 
 
 class Standstill:
@@ -50,7 +50,7 @@ class Standstill:
 
     def _watch(self) -> None:
         reported_s = interrupted_s = 0.0
-        while not self._closed.wait(POLL_S):
+        while not self._closed.wait(LOOK_EVERY_S):
             moved_s = self._moved_s
             now_s = time.monotonic()
             if now_s - moved_s < STANDS_S:

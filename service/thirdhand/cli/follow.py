@@ -48,7 +48,7 @@ def follow(args: argparse.Namespace) -> int:
         if args.gain is not None:
             arm.gain = args.gain
         stop = threading.Event()
-        end = _End(stop)
+        end = _Interruption(stop)
         ask_for_real_time()
         say(f"driving {args.arm} by cell {cell}; Ctrl-C ends it")
         playback = driven(arm, session, cell, stop=stop, wait_s=args.wait, interrupt=end.interrupt)
@@ -59,7 +59,7 @@ def follow(args: argparse.Namespace) -> int:
     return 0
 
 
-class _End:
+class _Interruption:
     """SIGINT and SIGTERM set `stop`; a loop that then stands still is interrupted."""
 
     def __init__(self, stop: threading.Event) -> None:

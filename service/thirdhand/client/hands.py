@@ -25,7 +25,7 @@ from thirdhand.process.progress import say
 Pose: TypeAlias = Sequence[float] | None
 """Numbers of a pose, see `Hands`."""
 MAX_PAUSE_S = 0.05  # after a longer pause, what was missed is not made up
-ATTRIBUTES: Mapping[str, Accepted] = {
+HANDS_ATTRIBUTES: Mapping[str, Accepted] = {
     "rate_hz": number(1.0, 1000.0, " Hz", math.inf),
     "frame_id": (is_frame, FRAME.rstrip(",")),
 }
@@ -54,7 +54,7 @@ class Hands(abc.ABC):
         What is no pose is not published: the first one is said, all are counted. Raises
         ExplainedError for a class that gives anything but two hands.
         """
-        check_attributes(self, ATTRIBUTES)
+        check_attributes(self, HANDS_ATTRIBUTES)
         refused = 0
         with Tracker(session, cell, timeout_s=None) as tracker:
             self._check_frame(Client(session, cell))
