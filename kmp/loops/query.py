@@ -135,7 +135,7 @@ class CompiledQuery(Immutable):
     def _packed(self, solution: Dense) -> Array:
         a = solution.distinct
         inverse = np.empty((len(self.rows) * a, len(self.rows) * a))
-        centres = np.ascontiguousarray(self.rows[:, : len(self.stretch)])
+        centres = np.array(self.rows[:, : len(self.stretch)], order="C")  # not read-only
         penalty = solution.hyperparameters.lambda_covariance
         noise = penalty * solution.database.reference.covariance[:, :a, :a]
         is_exact = len(inverse) <= _MOST_EXACT and not len(self.places)

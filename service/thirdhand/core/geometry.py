@@ -13,17 +13,9 @@ import numpy as np
 from kmp.compiled import compiled
 from kmp.elementary import atan2, sin_cos
 from thirdhand.core.frame import Records, Vector
-from thirdhand.core.vectors import add_product, cross, dot, norm, transform
+from thirdhand.core.vectors import add_product, cross, dot, norm, rounded, transform
 
-# parts of a unit; values are rounded so that machines that differ in the last bits agree
-ROUND_TO = 1e9
 _TINY = 1e-12  # a smaller sine is rounding
-
-
-@compiled
-def rounded(value: float, parts: float = ROUND_TO) -> float:
-    """A number, rounded to `parts` parts of a unit."""
-    return float(np.rint(value * parts) / parts)
 
 
 def rotation(quaternion: tuple[float, float, float, float]) -> Vector:
@@ -407,14 +399,3 @@ def to_box(segment: Vector, share: float, box: Vector, near: Vector) -> float:
     for i in range(3):
         near[6 + i] = side if i == face else 0.0
     return -depth
-
-
-@compiled
-def round_to(values: Vector, parts: float) -> None:
-    """Round values (3, 3) to `parts` parts of a unit, in place.
-
-    Results that follow are then equal on machines that differ in the last bits.
-    """
-    for i in range(3):
-        for j in range(3):
-            values[i, j] = rounded(values[i, j], parts)

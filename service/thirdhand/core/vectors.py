@@ -1,5 +1,5 @@
-"""Compiled arithmetic on vectors (3,). Each sum starts from 0 and adds the axes in order, which
-fixes its last bit, which that of BLAS is not: it differs between processors.
+"""Compiled arithmetic on numbers and vectors (3,). Each sum starts from 0 and adds the axes in
+order, which fixes its last bit, which that of BLAS is not: it differs between processors.
 """
 
 from __future__ import annotations
@@ -10,6 +10,9 @@ import numpy as np
 
 from kmp.compiled import compiled
 from thirdhand.core.frame import Vector
+
+# parts of a unit; values are rounded so that machines that differ in the last bits agree
+ROUND_TO = 1e9
 
 
 @compiled
@@ -86,3 +89,20 @@ def squared_distance(a: Vector, b: Vector) -> float:
 def distance(a: Vector, b: Vector) -> float:
     """|a - b|."""
     return math.sqrt(squared_distance(a, b))
+
+
+@compiled
+def rounded(value: float, parts: float = ROUND_TO) -> float:
+    """A number, rounded to `parts` parts of a unit."""
+    return float(np.rint(value * parts) / parts)
+
+
+@compiled
+def round_to(values: Vector, parts: float) -> None:
+    """Round values (3, 3) to `parts` parts of a unit, in place.
+
+    Results that follow are then equal on machines that differ in the last bits.
+    """
+    for i in range(3):
+        for j in range(3):
+            values[i, j] = rounded(values[i, j], parts)

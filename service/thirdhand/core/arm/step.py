@@ -16,9 +16,9 @@ from kmp.compiled import compiled
 from kmp.elementary import sin_cos
 from thirdhand.core.arm.least_squares import solve
 from thirdhand.core.frame import Records, Struct, Vector
-from thirdhand.core.geometry import quaternion_of, rounded, swing, turn_between
+from thirdhand.core.geometry import quaternion_of, swing, turn_between
 from thirdhand.core.numerics import MAX_ERROR_M, MAX_JOINT_RAD, ROUNDING
-from thirdhand.core.vectors import dot, norm, square
+from thirdhand.core.vectors import dot, norm, rounded, square
 
 SPEED = 1  # flag of a step: the velocities were scaled down to a joint's speed limit
 NEAR = 2  # flag of a step: a joint is near its position limit

@@ -22,7 +22,6 @@ from kmp.compiled import compiled
 from kmp.elementary import exp
 from thirdhand.core.codes import DOUBTED, LEARNING, TRUSTED
 from thirdhand.core.frame import Record, Records, Struct, Vector, as_array, parameters
-from thirdhand.core.geometry import rounded
 from thirdhand.core.intake import CONFIRMED_SAMPLES, KEPT, MODES
 from thirdhand.core.intake.mode_filter import advance
 from thirdhand.core.intake.motion_model import CHANGE, ENDLESS, REACH, model
@@ -30,7 +29,7 @@ from thirdhand.core.intake.tremor import no_tremor
 from thirdhand.core.intake.tuning import IntakeTuning
 from thirdhand.core.numerics import MAX_STAMP_DIFFERENCE_NS, TICK_ROUNDING
 from thirdhand.core.tuning import TUNING
-from thirdhand.core.vectors import add_product, norm, square, squared_distance
+from thirdhand.core.vectors import add_product, norm, rounded, square, squared_distance
 
 STILL = np.ones(2)  # stillness of two hands that rest
 

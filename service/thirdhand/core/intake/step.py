@@ -40,7 +40,6 @@ from thirdhand.core.codes import (
     UNSEEN,
 )
 from thirdhand.core.frame import Records, Struct, Vector
-from thirdhand.core.geometry import rounded
 from thirdhand.core.intake import CONFIRMED_SAMPLES, KEPT, SETTLED_SAMPLES
 from thirdhand.core.intake.arm_samples import compared, unwrap
 from thirdhand.core.intake.hand_estimator import (
@@ -62,7 +61,7 @@ from thirdhand.core.intake.retained_samples import (
     wrong_samples,
 )
 from thirdhand.core.intake.tremor import note_tremor
-from thirdhand.core.vectors import distance, square, squared_distance, transform
+from thirdhand.core.vectors import distance, rounded, square, squared_distance, transform
 
 
 @compiled

@@ -16,10 +16,10 @@ import numpy as np
 from kmp.compiled import compiled
 from kmp.elementary import exp, log
 from thirdhand.core.frame import Records, Struct, Vector
-from thirdhand.core.geometry import rounded
 from thirdhand.core.intake import BANK, NO_TREMOR, USUAL_RATE
 from thirdhand.core.intake.mode_filter import amplitude, measure, move_on
 from thirdhand.core.intake.motion_model import CHANGE, ENDLESS, REST
+from thirdhand.core.vectors import rounded
 
 
 @compiled

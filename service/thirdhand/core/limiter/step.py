@@ -9,10 +9,11 @@ import numpy as np
 from kmp.compiled import compiled
 from thirdhand.core.codes import FAULT
 from thirdhand.core.frame import Records, Struct, Vector
-from thirdhand.core.geometry import quaternion_of, rounded
+from thirdhand.core.geometry import quaternion_of
 from thirdhand.core.kinematics import tool_speed_after
 from thirdhand.core.numerics import INSIDE_LIMIT_SHARE, LARGEST_USABLE, ROUNDING, STOP_SAMPLES
 from thirdhand.core.stops import braking_together, fastest_stop
+from thirdhand.core.vectors import rounded
 
 BOUNDED = 1  # flag of a step: a wanted velocity was limited
 CHASED = 2  # flag of a step: a joint cannot reach its velocity in a tick at constant jerk

@@ -8,10 +8,10 @@ import numpy as np
 
 from kmp.compiled import compiled
 from thirdhand.core.frame import Record, Records, Vector, as_array, parameters
-from thirdhand.core.geometry import axis_of, quaternion_of, rounded, swing, turn_between, turn_on
+from thirdhand.core.geometry import axis_of, quaternion_of, swing, turn_between, turn_on
 from thirdhand.core.numerics import ROUNDING
 from thirdhand.core.tuning import TUNING, Tuning
-from thirdhand.core.vectors import dot, norm
+from thirdhand.core.vectors import dot, norm, rounded
 from thirdhand.settings.config import Settings
 
 

@@ -19,7 +19,6 @@ from kmp.compiled import compiled
 from kmp.named_arrays import from_arrays
 from thirdhand.contract.requests import ViaPoint
 from thirdhand.core.frame import Vector
-from thirdhand.core.geometry import round_to
 from thirdhand.core.skill import MAX_SKILL_DISTANCE_M, ORDER, SIGNS, TURNS
 from thirdhand.core.skill.memory import moving_features
 from thirdhand.core.skill.model import (
@@ -45,6 +44,7 @@ from thirdhand.core.skill.task import check_shapes
 from thirdhand.core.skill.task_clock import TaskClock
 from thirdhand.core.skill.tuning import TURN_WEIGHT_M
 from thirdhand.core.skill.via_points import neighbourhoods
+from thirdhand.core.vectors import round_to
 
 TURN_INPUTS = 18  # the entries of both hands' rotation matrices
 

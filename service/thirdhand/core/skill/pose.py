@@ -13,7 +13,7 @@ import numpy as np
 from kmp.compiled import compiled
 from kmp.elementary import sin_cos
 from thirdhand.core.frame import Vector
-from thirdhand.core.geometry import round_to, rounded, turn_on
+from thirdhand.core.geometry import turn_on
 from thirdhand.core.skill.tuning import (
     GRIPPER_CLOSE_ABOVE,
     GRIPPER_MOVES_S,
@@ -23,7 +23,7 @@ from thirdhand.core.skill.tuning import (
 
 if TYPE_CHECKING:
     from kmp import KMP
-from thirdhand.core.vectors import add_product, dot, times
+from thirdhand.core.vectors import add_product, dot, round_to, rounded, times
 
 
 def decided(gripper: int, closure: float, *, since_s: float = math.inf, off: float = 0.0) -> int:

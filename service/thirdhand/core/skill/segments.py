@@ -19,7 +19,6 @@ from kmp.elementary import exp, tanh
 from kmp.loops.kernel_row import add_weighted
 from kmp.loops.mean import add_table
 from thirdhand.core.frame import Record, Records, Vector
-from thirdhand.core.geometry import ROUND_TO, round_to, rounded
 from thirdhand.core.numerics import MOTION_STEP_S, UNPRIMED_DECIDED
 from thirdhand.core.skill.memory import turning
 from thirdhand.core.skill.model import COVARIANCE_ROUND_TO, MOTION_ROUND_TO, Seen
@@ -49,7 +48,7 @@ from thirdhand.core.skill.tuning import (
     UNSURE_M,
     WITH_HAND_POWER,
 )
-from thirdhand.core.vectors import dot, norm, squared_distance
+from thirdhand.core.vectors import ROUND_TO, dot, norm, round_to, rounded, squared_distance
 
 MOST_SEGMENTS = 64  # segments for which the state has room
 STAYS = 0.0  # `square` of a hand that rests

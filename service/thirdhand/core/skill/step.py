@@ -12,11 +12,11 @@ from kmp.compiled import compiled
 from kmp.elementary import acos, exp, sin_cos
 from thirdhand.core.codes import AMBIGUOUS
 from thirdhand.core.frame import Records, Vector
-from thirdhand.core.geometry import rounded
 from thirdhand.core.skill.model import COVARIANCE_ROUND_TO, REGION_95
 from thirdhand.core.skill.skill import is_inside
 from thirdhand.core.skill.support import error_probability
 from thirdhand.core.skill.tuning import AMBIGUOUS_PROBABILITY, AMBIGUOUS_S, TRAIL_S, UNSURE_M
+from thirdhand.core.vectors import rounded
 
 NO_SEGMENT = -1  # segment in a frame while it is not known
 # what `conclude` returns, added

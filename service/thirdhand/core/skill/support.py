@@ -40,7 +40,6 @@ from kmp.compiled import compiled
 from kmp.elementary import exp, log
 from kmp.loops.mean import add_table, exponentials, sum_products, table_of
 from thirdhand.core.frame import Vector
-from thirdhand.core.geometry import rounded
 from thirdhand.core.numerics import PROBABILITY_ROUND_TO
 from thirdhand.core.skill.task_clock import TaskClock
 from thirdhand.core.skill.tuning import (
@@ -52,6 +51,7 @@ from thirdhand.core.skill.tuning import (
     SUPPORT_SHARPNESS,
     UNSURE_M,
 )
+from thirdhand.core.vectors import rounded
 
 
 @dataclass(frozen=True, eq=False, repr=False)
