@@ -187,13 +187,14 @@ class Dense(Expansion):
         database = self.database.changed(changes)
         first = int(replaced[0]) if len(replaced) else count
         if len(replaced) and self.database.reference.mean.size <= SINGLE:
-            return Dense(self.hyperparameters, database, self)  # a fit takes less than a change
+            return Dense(self.hyperparameters, database)  # a fit takes less than a change
         if count - first > 2 * len(replaced) and len(replaced) <= _MOST_REMOVED * count:
             solution = Dense(self.hyperparameters, database, self, count - len(replaced), replaced)
             if solution.distinct >= self.distinct:
                 return solution
-        shared = first if first >= _LEAST_SHARED * count else 0
-        return Dense(self.hyperparameters, database, self, shared)
+        if first >= _LEAST_SHARED * count:
+            return Dense(self.hyperparameters, database, self, first)
+        return Dense(self.hyperparameters, database)
 
     def extended(self, database: Database) -> Dense:
         """The solution of a database that begins with this one: the factors get a border."""
@@ -304,7 +305,7 @@ class Dense(Expansion):
             base_factor = (
                 kron_identity(base_factor, d) if self.distinct == d else base_factor[::d, ::d]
             )
-        if base_factor is None or self.same == 0:
+        if base_factor is None:
             # In place: the matrix is symmetric, and its transpose has LAPACK's order.
             factor, info = lapack.dpotrf(rows.T, lower=1, clean=1, overwrite_a=1)
             solver: Array | _Bordered = frozen(factor)
@@ -333,9 +334,7 @@ class Dense(Expansion):
             o = kernel.channels * self.distinct
             removed_points = self.base.database.functionals.take(self.gone)
             removed = _Removed.out_of(shared, (self.gone[:, None] * o + np.arange(o)).ravel())
-            across = between(
-                kernel, removed_points, self.database.functionals.take(slice(self.same, None))
-            )
+            across = between(kernel, removed_points, self._added.functionals)
             border = removed.projected(shared, columns, kron_identity(across, self.distinct))
         corner, info = lapack.dpotrf(rows[:, p:] - border.T @ border, lower=1, clean=1)
         return _Bordered(frozen(shared), frozen(border), frozen(corner), removed), info

@@ -79,12 +79,6 @@ class Gaussians(Immutable):
         """(N, O) true where an output is free: its deviation in `of` was infinite."""
         return np.asarray(np.diagonal(self.covariance, axis1=1, axis2=2) > _FREE_ABOVE)
 
-    @property
-    def has_limits(self) -> bool:
-        """True if an output is exact or free."""
-        variances = np.diagonal(self.covariance, axis1=1, axis2=2)
-        return bool(((variances < _EXACT_BELOW) | (variances > _FREE_ABOVE)).any())
-
     def __len__(self) -> int:
         return len(self.mean)
 

@@ -34,10 +34,9 @@ from kmp.problem.hyperparameters import Hyperparameters
 from kmp.solution import BaseSolution, Expansion, Solution
 
 _ONE_SHAPE = 1e-14  # differences between the shapes of covariances that are rounding
-# lambda Sigma / k(s, s) of free outputs, and of free and exact ones that a map mixes: a ratio that
-# leaves two digits of the exact one's
-_FREE_SHARE = 1e8
-_MIXED_FREE = 1e4
+_FREE_SHARE = 1e8  # an output is free above this lambda Sigma / k(s, s)
+_MIXED_FREE = 1e4  # lambda Sigma / k(s, s) of a free output that a map mixes with others
+# that of an exact output there: the rounding of the free one leaves it two digits
 _MIXED_EXACT = 1e-10
 
 
@@ -62,8 +61,8 @@ def output_map(parameters: Hyperparameters, reference: Gaussians) -> Array | Non
         rotated = _basis(root, reference.covariance)
     if prior is None and rotated is None:
         return None
-    inside = root if rotated is None else root @ rotated
-    return frozen(np.kron(np.eye(parameters.kernel.channels), inside))
+    matrix = root if rotated is None else root @ rotated
+    return frozen(np.kron(np.eye(parameters.kernel.channels), matrix))
 
 
 def _basis(root: NDArray[Any], covariance: Array) -> Array | None:
@@ -150,7 +149,7 @@ def _of_fixed(
     """Mean (O,) and covariance (O, O) of x for one normal of y = T x with free or exact outputs.
 
     With the rows H of T of the outputs that are not free: x = H^+ y and H^+ Sigma H^+T, plus a
-    variance in the null space of H by which rounding does not hide the least one.
+    variance in the null space of H, so small that rounding does not hide the least one.
     """
     prior = _prior_variances(parameters, point, t)[0]
     variance = np.diagonal(normal.covariance[0])
@@ -391,18 +390,16 @@ def as_one(base: Solution) -> BaseSolution:
 
 
 def constrained(solution: Solution, constraints: LinearConstraints) -> Solution:
-    """A solution as one system with these constraints instead of any other."""
+    """A solution as one system, with these constraints."""
     if isinstance(solution, Mapped):
-        inside = LinearConstraints(
+        inner_constraints = LinearConstraints(
             constraints.inputs,
             constraints.normals @ solution.t,
             constraints.bounds,
             constraints.directions,
         )
-        inner = constrained(solution.inner, inside)
+        inner = constrained(solution.inner, inner_constraints)
         return replace(solution, inner=inner, constraints=constraints)
-    if isinstance(solution, Constrained):
-        return constrained(solution.solution, constraints)
     assert isinstance(solution, Dense), "as one"
     return Constrained(solution, constraints)
 
@@ -410,4 +407,4 @@ def constrained(solution: Solution, constraints: LinearConstraints) -> Solution:
 def is_one(solution: Solution) -> bool:
     """True if constraints can be added to the solution."""
     inner = solution.inner if isinstance(solution, Mapped) else solution
-    return isinstance(inner, (Dense, Constrained))
+    return isinstance(inner, Dense)

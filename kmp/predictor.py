@@ -152,7 +152,7 @@ class Predictor(Immutable):
         *,
         covariance: bool = True,
     ) -> MotionPrediction:
-        """xi at one query (I,) and its motion with the input, from one kernel row.
+        """xi at one query (I,) and its motion with the input.
 
         The input's velocity v (I,) [unit of the inputs / s] and acceleration a (I,) [unit of the
         inputs / s^2] give those of the output: J v, and J a + d^2 xi(s + t v)/dt^2. The numbers are
@@ -275,11 +275,9 @@ class Predictor(Immutable):
     def _dimensions(self) -> int:
         return int(self.inner.solution.database.inputs.shape[1])
 
-    def _rows(self, queries: Array, directions: Array | None = None) -> Array:
-        """k (M C, R C) between M queries, or derivatives there, and the solution's functionals."""
-        return between(
-            self.kernel, Functionals(queries, directions), self.inner.solution.functionals
-        )
+    def _rows(self, queries: Array) -> Array:
+        """k (M C, R C) between M queries and the solution's functionals."""
+        return between(self.kernel, Functionals(queries), self.inner.solution.functionals)
 
     def _scaled(self, posterior: Array) -> Array:
         """N / lambda_c times posterior covariances (M, n, n), made positive semi-definite."""

@@ -207,8 +207,8 @@ class KMP(Predictor, Plotted, Saved):
         points = changes.functionals.take(remaining)
         normals = changes.points.take(remaining)
         before = self.base.inner.changes
-        changes = self._changes(before, points, normals, self._tolerance(tolerance))
-        return _combined(self.base, changes, self._constraints)
+        remaining_changes = self._changes(before, points, normals, self._tolerance(tolerance))
+        return _combined(self.base, remaining_changes, self._constraints)
 
     def adapt_jacobian(self, inputs: ArrayLike, jacobians: ArrayLike, *, deviation: float) -> KMP:
         """A new primitive with these Jacobians dxi/ds at inputs (V, I): jacobians (V, O, I).
@@ -575,8 +575,9 @@ class Alternatives(Sequence[KMP]):
     def mean(self, queries: ArrayLike) -> Array:
         """The means (G, M, O) of all G primitives at queries (M, I), equal to theirs to 1e-8.
 
-        Of many goals with the same number of via-points it takes hardly more time than of one.
-        Raises ValueError as `KMP.mean` does.
+        Goals at the same inputs with the same covariances take at most V O + 1 adaptations. Goals
+        at other inputs take one solve, if the primitive is a single system without via-points and
+        constraints; else each takes an adaptation. Raises ValueError as `KMP.mean` does.
         """
         solution = self._primitive.inner.solution
         if constraints_of(solution) is None and len({len(via) for via in self._inputs}) == 1:
@@ -596,7 +597,10 @@ class Alternatives(Sequence[KMP]):
         points = Functionals(np.concatenate(self._inputs))
         normals = Gaussians.concatenated(self._desired)
         added = Database(points, resolved(solution.hyperparameters, points, normals))
-        check_resolved(solution.hyperparameters, added)
+        is_low_rank = solution.representation == "low_rank"
+        check_resolved(solution.hyperparameters, added, both=is_low_rank)
+        if is_low_rank:
+            check_resolved(solution.hyperparameters, added, name="lambda_mean", both=True)
         period = self._primitive.kernel.period
         replaced = [
             solution.database.nearest(Functionals(via), self._tolerance, period)

@@ -1,4 +1,4 @@
-"""Mean, derivatives and covariance at one query, from one kernel row.
+"""Mean, derivatives and covariance at one query.
 
 With w (R C, D) the weights: xi(s) = k(s) w + m(s), equation (8); J = dxi/ds; for an input that
 moves with v and a, d xi/dt = J v and d^2 xi/dt^2 = J a + d^2 xi(s + t v)/dt^2. Covariance N /

@@ -182,10 +182,10 @@ def resolved(parameters: Hyperparameters, points: Functionals, normals: Gaussian
     """The normals of N points, with the least variance for exact outputs instead of 0, and for free
     ones one that hardly pulls.
     """
-    if not normals.has_limits:
-        return normals
     exact = normals.exact
     free = normals.free
+    if not (exact | free).any():
+        return normals
     penalty = min(parameters.lambda_mean, parameters.lambda_covariance)
     least = least_variances(parameters, points, penalty).repeat(parameters.channel_outputs, axis=1)
     least = least * np.tile(parameters.prior_variances, parameters.kernel.channels)

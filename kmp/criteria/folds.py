@@ -103,9 +103,14 @@ class _System:
 
     def _solution(self, penalty: float) -> Dense | LowRank:
         database = self.fold.database
-        slopes = np.zeros((database.reference.outputs, database.inputs.shape[1]))
-        prior = self.fold.prior_mean
-        parameters = Hyperparameters(self.kernel, penalty, penalty, prior, slopes)
+        parameters = Hyperparameters.checked(
+            self.kernel,
+            penalty,
+            None,
+            self.fold.prior_mean,
+            inputs=database.inputs.shape[1],
+            outputs=database.reference.outputs,
+        )
         if self._features is None:
             return Dense(parameters, database).solved()
         return LowRank.fit(parameters, database, self._features)

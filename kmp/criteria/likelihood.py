@@ -93,8 +93,10 @@ def negative_log_likelihood(
 
     None if K + lambda Sigma is not positive definite.
     """
-    slopes = np.zeros((len(prior_mean), points.inputs.shape[1]))
-    parameters = Hyperparameters(kernel, lambda_mean, lambda_mean, prior_mean, slopes)
+    inputs = points.inputs.shape[1]
+    parameters = Hyperparameters.checked(
+        kernel, lambda_mean, None, prior_mean, inputs=inputs, outputs=len(prior_mean)
+    )
     solution = Dense(parameters, points)
     try:
         factor = solution.mean_factor

@@ -125,12 +125,8 @@ class Features(Immutable):
         weights[np.arange(len(w)), self.channels] = values
         return weights.reshape(len(w), -1)
 
-    def residual(self, points: Functionals) -> Array:
-        """k(s, s) - |z(s)|^2 of n points, for each channel, as a share of k(s, s): (n, C)."""
-        return self.residual_of(points, self(points))
-
     def residual_of(self, points: Functionals, z: Array) -> Array:
-        """The residual (n, C), of n points whose features (r, n C) are known."""
+        """k(s, s) - |z(s)|^2 as a share of k(s, s): (n, C), of n points with features (r, n C)."""
         shares = 1 - (z * z).sum(axis=0).reshape(len(points), -1) / variances(self.kernel, points)
         return np.asarray(np.maximum(shares, FLOOR))
 

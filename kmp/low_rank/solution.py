@@ -282,7 +282,7 @@ class Conditioned(Expansion):
     of `Solution`.
     """
 
-    _not_pickled = frozenset({"database", "_added_points", "_neglected"})
+    _not_pickled = frozenset({"database", "_neglected"})
 
     base: LowRank
     changes: Changes
@@ -353,7 +353,7 @@ class Conditioned(Expansion):
     @cached_property
     def _points(self) -> Database:
         """The U changed points, those added first."""
-        return self._added_points.joined(self.base.database.take(self.changes.replaced))
+        return self.changes.added.joined(self.base.database.take(self.changes.replaced))
 
     @cached_property
     def _z(self) -> Array:
@@ -363,10 +363,6 @@ class Conditioned(Expansion):
     @cached_property
     def _covariance_system(self) -> _System:
         return self._system("lambda_covariance", self.base.covariance_factor)
-
-    @cached_property
-    def _added_points(self) -> Database:
-        return Database(self.changes.functionals, self.changes.points)
 
     @cached_property
     def _neglected(self) -> Array:
@@ -406,7 +402,7 @@ class Conditioned(Expansion):
         parameters = self.hyperparameters
         count = len(self._points)
         first = len(self.base.database) - len(self.changes.replaced)
-        check_resolved(parameters, self._added_points, first=first, name=name, both=True)
+        check_resolved(parameters, self.changes.added, first=first, name=name, both=True)
         penalty = parameters.lambda_mean if name == "lambda_mean" else parameters.lambda_covariance
         d = self.base.w.shape[1]
         cross, _ = lapack.dtrtrs(base_factor, kron_identity(self._z, d), lower=1)

@@ -41,6 +41,11 @@ class Changes(NamedTuple):
         """The inputs (V, I) of the via-points."""
         return self.functionals.inputs
 
+    @property
+    def added(self) -> Database:
+        """The via-points."""
+        return Database(self.functionals, self.points)
+
     def near(
         self, points: Functionals, tolerance: float, period: float | None
     ) -> NDArray[np.bool_]:
@@ -107,16 +112,10 @@ class Database(Immutable):
 
     def changed(self, changes: Changes) -> Database:
         """The database after the changes: the points not replaced, then the via-points."""
-        functionals = self.functionals
-        reference = self.reference
+        remaining = self
         if len(changes.replaced):
-            remaining = np.delete(np.arange(len(self)), changes.replaced)
-            functionals = functionals.take(remaining)
-            reference = reference.take(remaining)
-        return Database(
-            Functionals.concatenated([functionals, changes.functionals]),
-            Gaussians.concatenated([reference, changes.points]),
-        )
+            remaining = self.take(np.delete(np.arange(len(self)), changes.replaced))
+        return remaining.joined(changes.added)
 
     def spacing(self, period: float | None) -> float:
         """Median distance [unit of inputs] of a value to its nearest neighbour; 0 without any."""

@@ -106,8 +106,16 @@ def test_goals_without_via_points_or_lost_in_rounding():
     nothing = np.empty((0, 1)), Gaussians.of(np.empty((0, 2)), deviation=0.1)
     means = adapted.adapt_many([nothing, nothing]).mean(QUERIES)
     np.testing.assert_allclose(means, [adapted.mean(QUERIES)] * 2, atol=1e-12)
-    for of in (adapted, adapted.base):
-        lost = of.adapt_many(goals(of, OTHER, deviation=1e-9))
+    low_rank = KMP.fit(
+        INPUTS,
+        adapted.base.reference,
+        kernel=GaussianKernel(6.0),
+        lambda_mean=1e-4,
+        lambda_covariance=1.0,
+        representation="low_rank",
+    )
+    for of, deviation in ((adapted, 1e-9), (adapted.base, 1e-9), (low_rank, 1e-4)):
+        lost = of.adapt_many(goals(of, OTHER, deviation=deviation))
         with pytest.raises(ValueError, match="would be lost in rounding"):
             lost.mean(QUERIES)
 

@@ -210,7 +210,8 @@ def test_one_scale_keeps_ratio_of_lengths():
 # --- by the marginal likelihood of the reference ---
 
 
-def database(dimensions, outputs):
+def database():
+    dimensions, outputs = 3, 2
     random = np.random.default_rng(0)
     inputs = random.uniform(0, 2, (20, dimensions))
     roots = 0.1 * random.normal(size=(20, outputs, outputs)) + 0.2 * np.eye(outputs)
@@ -219,7 +220,7 @@ def database(dimensions, outputs):
 
 
 def test_likelihood_is_that_of_scipy():
-    points = database(3, 2)
+    points = database()
     kernel = GaussianKernel([2.0, 0.3, 5.0])
     value, signal = negative_log_likelihood(points, np.zeros(2), kernel, 0.7)
     total = np.kron(kernel(points.inputs, points.inputs), np.eye(2))
