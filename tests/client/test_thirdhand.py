@@ -276,7 +276,7 @@ WRONG: dict[str, tuple[Callable[[Connection], object], str]] = {
     ),
     "objects that are none": (
         lambda cell: cell.objects(None),
-        "objects: None given; a list needed",
+        "objects: None given; SceneObjects needed",
     ),  # type: ignore[arg-type]
     "a point": (
         lambda cell: cell.teach("a", left=(1, 2), right=(1, 2, 3), tool=(1, 2, 3)),

@@ -4,6 +4,7 @@ continuing from a state bit for bit.
 
 from __future__ import annotations
 
+import enum
 from collections.abc import Iterable
 from dataclasses import replace
 
@@ -29,6 +30,7 @@ from support.paths import RECORDINGS
 from support.wam import URDF
 from thirdhand.contract import channels
 from thirdhand.contract.records import Flag, Mode, Reason
+from thirdhand.core import codes
 from thirdhand.core.controller import Controller
 from thirdhand.core.frame import Event, Tick, definitions, order
 from thirdhand.core.skill.model import Regions
@@ -330,3 +332,23 @@ def test_twin_decides_the_same(taught: Skill) -> None:
     frame = twin.step(ticks[-1])
     assert controller.state.tobytes() == before
     assert controller.step(ticks[-1]).tobytes() == frame.tobytes()
+
+
+PLAIN_NAMES = {
+    codes.Condition: "{}",
+    codes.LedBy: "BY_{}",
+    codes.Start: "STARTS_{}",
+    codes.ArmReady: "{}",
+    codes.Stuck: "{}",
+    codes.Held: "HELD_{}",
+    codes.SetpointStep: "{}",
+    codes.SetpointBound: "{}_BOUND",
+    codes.ClockTrust: "{}",
+}
+
+
+@pytest.mark.parametrize("kind", PLAIN_NAMES)
+def test_plain_codes_are_those_of_their_enumeration(kind: type[enum.IntEnum]) -> None:
+    for member in kind:
+        name = PLAIN_NAMES[kind].format(member.name).replace("NONE_BOUND", "NO_BOUND")
+        assert getattr(codes, name) == member.value

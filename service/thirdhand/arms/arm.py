@@ -62,6 +62,7 @@ class Arm(AbstractContextManager["Arm"]):
         self.limits = settings.joints  # names and limits; nothing that is written exceeds them
         self.address = address
         self._due_s = time.monotonic()
+        self._max_velocity = np.array(settings.joints.velocity)
         self._position: Vector | None = None  # of the motion that `lead` wrote last
         self._ahead = np.zeros(len(self.limits.names))  # what was written led it by this
 
@@ -131,7 +132,7 @@ class Arm(AbstractContextManager["Arm"]):
 
         # motion and lead together keep the speed limits, except where the arm was led by hand
         before = position if self._position is None else self._position
-        max_step = np.array(self.limits.velocity) * self.period_s
+        max_step = self.period_s * self._max_velocity
         step = (position - before).clip(-max_step, max_step)
         ahead = (ahead - self._ahead).clip(-max_step - step, max_step - step) + self._ahead
 

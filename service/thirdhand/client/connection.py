@@ -43,8 +43,8 @@ from thirdhand.contract.messages import (
 from thirdhand.contract.requests import ANSWER_TIMEOUT_S, REQUEST_NORM_TOLERANCE, Reply
 
 LARGEST_STD = 1e3  # [m, rad]
-# The first message on a channel waits this long for a subscriber. Later ones may be lost as long,
-# so that a daemon restarts without an error in a tracker.
+# The first message on a channel waits this long for a subscriber. If the subscriber disappears, a
+# call raises an error only after this time, as a daemon may restart.
 LISTENER_TIMEOUT_S = 5.0
 FORMS = {  # by the largest count of numbers
     1: "0 (open) to 1 (closed)",
@@ -88,7 +88,7 @@ class Connection(Client, AbstractContextManager["Connection"]):
 
     Each publishing call raises ValueError, before anything is sent, for values of another form or
     not finite; the daemon checks frame, distance and time. It raises UnreachableError if nobody
-    listens, nor did in a call of the last 5 s.
+    listens, and nobody did in the last 5 s.
     """
 
     def __init__(
@@ -205,7 +205,7 @@ class Connection(Client, AbstractContextManager["Connection"]):
         observation. It takes the place of an earlier chunk as long as it lasts; what that one has
         for later stays.
         """
-        chunk = [_wish(pose, std, frame_id) for pose in _listed("poses", poses)]
+        chunk = [_wish(pose, std, frame_id) for pose in _listed("poses", poses, "a list")]
         if not chunk:
             raise ValueError("poses: none given; at least one needed")
         step_ns = 1e9 * checked_seconds("step_s", step_s)
@@ -222,7 +222,7 @@ class Connection(Client, AbstractContextManager["Connection"]):
 
     def objects(self, objects: Iterable[SceneObject], *, stamp_ns: int | None = None) -> None:
         """Publish all objects on the bench, for viewers and recordings."""
-        scene = _listed("objects", objects)
+        scene = _listed("objects", objects, "SceneObjects")
         for scene_object in scene:
             _check_object(scene_object)
         # raises the error that the daemon would report of all together
@@ -313,12 +313,12 @@ class Connection(Client, AbstractContextManager["Connection"]):
         return self._publishers.setdefault(suffix, publisher)
 
 
-def _listed(what: str, given: Iterable[Any]) -> tuple[Any, ...]:
+def _listed(what: str, given: Iterable[Any], needed: str) -> tuple[Any, ...]:
     """The members of what was given. Raises ValueError."""
     try:
         return tuple(given)
     except TypeError:
-        raise ValueError(f"{what}: {reprlib.repr(given)} given; a list needed") from None
+        raise ValueError(f"{what}: {reprlib.repr(given)} given; {needed} needed") from None
 
 
 def _check_object(scene_object: Any) -> None:

@@ -60,8 +60,8 @@ class Stuck(enum.IntEnum):
 class Held(enum.IntEnum):
     """Knowledge of the hands at the begin of an operator's hold."""
 
-    HANDS_UNSEEN = 1  # a hand that the skill needs was not seen
-    HANDS_SEEN = 2
+    UNSEEN = 1  # a hand that the skill needs was not seen
+    SEEN = 2
 
 
 class SetpointStep(enum.IntEnum):
@@ -122,7 +122,7 @@ HELD_UNSEEN, HELD_SEEN = map(int, Held)
 PLANNED, STOPPED, BROKEN = map(int, SetpointStep)
 (
     NO_BOUND,
-    FINITE_BOUND,
+    NOT_FINITE_BOUND,
     SPEED_BOUND,
     ACCELERATION_BOUND,
     JERK_BOUND,

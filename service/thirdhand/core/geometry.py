@@ -161,7 +161,7 @@ def turn_between(start: Vector, end: Vector, out: Vector) -> None:
 @compiled
 def turn_on(quaternion: Vector, turn: Vector) -> None:
     """Rotate a quaternion (4,) by a rotation vector (3,) [rad] of the base frame, in place."""
-    angle = math.sqrt(turn[0] * turn[0] + turn[1] * turn[1] + turn[2] * turn[2])
+    angle = norm(turn)
     sine, cosine = sin_cos(0.5 * angle)
     size = 0.5 if angle < 1e-6 else sine / angle
     ax = size * turn[0]

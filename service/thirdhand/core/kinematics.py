@@ -14,8 +14,8 @@ from thirdhand.core.vectors import add_product, cross, square, transform
 
 
 class Kinematics:
-    """The arm at some joints, as one record (1,), whose fields are attributes; `Arm.at` computes
-    it.
+    """The arm at some joints, as one record (1,), whose fields are attributes; `ArmStage.at`
+    computes it.
 
     * `joints` (J,) [rad, m].
     * `position` (3,) [m] and `rotation` (3, 3) of the tool, frame base.
@@ -89,6 +89,7 @@ def tool_speed_after(kinematics: Struct, way: Vector, dq: Vector) -> float:
     axis = np.empty(3)
     moment = np.empty(3)
     turn = np.empty((3, 3))
+    turned = np.empty((3, 3))
     moved = np.empty(3)
     for j in range(len(dq)):
         # the moment about the origin: the tool's velocity less w × tool
@@ -121,9 +122,9 @@ def tool_speed_after(kinematics: Struct, way: Vector, dq: Vector) -> float:
         # (R, s), with this joint's motion after those before
         transform(rotation, shift, moment, moved)
         shift[:] = moved
-        before = rotation.copy()
-        rotation[:] = 0.0
-        add_product(before, turn, rotation)
+        turned[:] = 0.0
+        add_product(rotation, turn, turned)
+        rotation[:] = turned
 
     # the tool, moved by all joints
     transform(rotation, origin, tool, moved)

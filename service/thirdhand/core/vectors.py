@@ -59,13 +59,13 @@ def add_product(left: Vector, right: Vector, out: Vector) -> None:
 
 @compiled
 def transform(
-    turn: Vector, origin: Vector, point: Vector | tuple[float, float, float], out: Vector
+    matrix: Vector, origin: Vector, point: Vector | tuple[float, float, float], out: Vector
 ) -> None:
-    """Write into out (3,) a point (3,) after a rotation (3, 3) and a shift: origin + turn point."""
+    """Write origin + matrix point, all (3,) with a matrix (3, 3), into the first three of `out`."""
     for row in range(3):
         out[row] = origin[row]
         for k in range(3):
-            out[row] += turn[row, k] * point[k]
+            out[row] += matrix[row, k] * point[k]
 
 
 @compiled
@@ -106,3 +106,12 @@ def round_to(values: Vector, parts: float) -> None:
     for i in range(3):
         for j in range(3):
             values[i, j] = rounded(values[i, j], parts)
+
+
+@compiled
+def squared_amplitude(displacement: Vector, velocity: Vector, rate: float) -> float:
+    """Squared amplitude |y|² + |w|² / ω² of an oscillation y (3,) with the velocity w (3,)."""
+    total = 0.0
+    for i in range(3):
+        total += displacement[i] ** 2 + (velocity[i] / rate) ** 2
+    return total

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from kmp.compiled import compiled
 from thirdhand.core.frame import Records, Vector
-from thirdhand.core.intake.hand_estimator import smoothing, stillness_after
+from thirdhand.core.intake.hand_estimator import STILL, smoothing, stillness_after
 from thirdhand.core.skill.segments import add_followed, along_both, on_way, recognise
 from thirdhand.core.skill.tuning import FIRST_SEGMENT_ODDS
 from thirdhand.core.tuning import TUNING
@@ -60,7 +60,7 @@ def all_followed(
 def stillness_of(velocities: Vector, period_s: float) -> Vector:
     """Stillness (T, 2) of both hands with the velocities (T, 6) [m/s]. Both start still."""
     out = np.empty((len(velocities), 2))
-    stillness = np.ones(2)
+    stillness = STILL.copy()
     gains = smoothing(period_s)
     still_mps = TUNING.intake.hand_still_mps
     lowpass = np.zeros((2, 3))

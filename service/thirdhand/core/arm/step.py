@@ -179,11 +179,12 @@ def joint_step(
     """
     arm = arms[0]
     kinematics = heres[0]
+    goal = goals[0]
     task_count, joints = kinematics.tasks.shape
 
     # The programme: what the tool shall do, what the joints can do, and what separation allows.
     wish = np.empty(task_count)
-    damping = kinematics.damping + _wish(arm, kinematics, goals[0], wish)
+    damping = kinematics.damping + _wish(arm, kinematics, goal, wish)
     scaled = np.empty((task_count, joints))
     home = np.empty(joints)
     bounds = np.empty((2, joints))
@@ -206,18 +207,18 @@ def joint_step(
 
     # If the joints cannot reach this soon, the turn is reduced, so that the position is kept. This
     # mixes two solutions, and a mixture need not keep separation's rows.
-    is_reachable = _can_have(arm, goals[0], velocity)
+    is_reachable = _can_have(arm, goal, velocity)
     scaled[3:] = 0.0
     wish[3:] = 0.0
     if not is_reachable and not is_constrained:
         without_turn = np.empty(joints)
-        _brake_idle(arm, goals[0], home)
+        _brake_idle(arm, goal, home)
         solve(scaled, wish, home, damping, bounds, rows, limits, without_turn)
-        _turn_less(arm, goals[0], velocity, without_turn)
+        _turn_less(arm, goal, velocity, without_turn)
     excess = _excess(arm, velocity)
 
     # The accelerations: the same programme, without turn and separation.
-    _wish_acceleration(arm, goals[0], wish, home, bounds)
+    _wish_acceleration(arm, goal, wish, home, bounds)
     solve(scaled, wish, home, damping, bounds, rows[:0], limits[:0], out[1])
 
     for j in range(joints):

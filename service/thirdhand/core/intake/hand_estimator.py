@@ -3,12 +3,15 @@ samples.
 
 The estimator is an interacting-multiple-model filter (`mode_filter`) with the modes rest, steady,
 reach and change. The modes share one measurement noise variance r, which is estimated from the
-third differences of the samples (`retained_samples`): smooth motion leaves almost nothing in them,
-and white noise of variance r leaves the variance 20 r on each axis.
+third differences of the samples: smooth motion leaves almost nothing in them, and white noise of
+variance r leaves the variance 20 r on each axis.
 
 Stillness, 0 to 1, distinguishes a hand that waits at a via-point from one on its way. It rises
 slowly and falls at once. A tremor does not lower it, and a turning point on the way hardly raises
 it.
+
+The newest KEPT samples of each hand are retained in rings, each with the state of the filter after
+it. `order` counts them backward from the newest, which is 0.
 """
 
 from __future__ import annotations
@@ -22,14 +25,14 @@ from kmp.compiled import compiled
 from kmp.elementary import exp
 from thirdhand.core.codes import DOUBTED, LEARNING, TRUSTED
 from thirdhand.core.frame import Record, Records, Struct, Vector, as_array, parameters
-from thirdhand.core.intake import CONFIRMED_SAMPLES, KEPT, MODES
-from thirdhand.core.intake.mode_filter import advance
-from thirdhand.core.intake.motion_model import CHANGE, ENDLESS, REACH, model
-from thirdhand.core.intake.tremor import no_tremor
+from thirdhand.core.intake import CONFIRMED_SAMPLES, KEPT, MODES, SETTLED_SAMPLES
+from thirdhand.core.intake.mode_filter import advance, start, update
+from thirdhand.core.intake.motion_model import ENDLESS, REACH, model
+from thirdhand.core.intake.tremor import no_tremor, note_tremor
 from thirdhand.core.intake.tuning import IntakeTuning
 from thirdhand.core.numerics import MAX_STAMP_DIFFERENCE_NS, TICK_ROUNDING
 from thirdhand.core.tuning import TUNING
-from thirdhand.core.vectors import add_product, norm, rounded, square, squared_distance
+from thirdhand.core.vectors import add_product, rounded, square
 
 STILL = np.ones(2)  # stillness of two hands that rest
 
@@ -166,45 +169,6 @@ def is_fresh(state: Struct, side: int, stale_ticks: int) -> bool:
 
 
 @compiled
-def goes_on(state: Struct, config: Struct, side: int, position: Vector) -> bool:
-    """True if a hand that is seen again at x (3,) [m] continues its filter: its newest sample is
-    less than `unseen_ticks` old, and |x - p|² < outlier_variances (P + r).
-
-    p is the estimated position, P the position's variance in the mode CHANGE, r the noise variance.
-    """
-    square_m2 = squared_distance(position, state.hands[side, 0])
-    variance = state.mode_covariances[side, CHANGE, 0, 0] + state.noise_variance[side]
-    return bool(
-        is_fresh(state, side, config.unseen_ticks)
-        and square_m2 < config.outlier_variances * variance
-    )
-
-
-@compiled
-def turn_to(
-    state: Struct, side: int, turn: tuple[float, float, float, float], mapping: Vector
-) -> None:
-    """Store the orientation of one hand as a rotation matrix in frame base, row by row.
-
-    `turn` is the quaternion x y z w in the tracker's axes. `mapping` (3, 4) maps the tracker's
-    coordinates to base: rotation times unit [m], and origin.
-    """
-    x, y, z, w = turn
-    s = 2.0 / (x * x + y * y + z * z + w * w)
-    rotation = np.array(
-        (
-            (1.0 - s * (y * y + z * z), s * (x * y - z * w), s * (x * z + y * w)),
-            (s * (x * y + z * w), 1.0 - s * (x * x + z * z), s * (y * z - x * w)),
-            (s * (x * z - y * w), s * (y * z + x * w), 1.0 - s * (x * x + y * y)),
-        )
-    )
-    unit = norm(mapping[:, 0])
-    turned = state.hand_turns[side].reshape((3, 3))
-    turned[:] = 0.0
-    add_product(mapping[:, :3] / unit, rotation, turned)
-
-
-@compiled
 def seconds_after(stamp_ns: int, other_ns: int) -> float:
     """Difference `stamp_ns` - `other_ns` in seconds, without overflow for any two stamps."""
     apart_ns = float(stamp_ns) - float(other_ns)
@@ -274,10 +238,11 @@ def note_clock(state: Struct, config: Struct, side: int, stamp_ns: int, fresh: b
         stamps[1] = stamps[0]
         ticks[1] = ticks[0]
         longest[1] = longest[0]
-    if restarts or is_over:
+    is_new_window = restarts or is_over
+    if is_new_window:
         state.clock_tick[side] = state.tick
         longest[0] = 0
-    if restarts or is_over or later_s < 0.0:  # a new window, or a new minimum
+    if is_new_window or later_s < 0.0:  # or a new minimum
         stamps[0] = stamp_ns
         ticks[0] = state.tick
 
@@ -291,3 +256,136 @@ def note_clock(state: Struct, config: Struct, side: int, stamp_ns: int, fresh: b
 def slot(state: Struct, side: int, order: int) -> int:
     """Index in a hand's ring of its sample number `order`; 0 is the newest."""
     return int((state.kept_newest[side] - order) % KEPT)
+
+
+@compiled
+def take(
+    state: Struct,
+    config: Struct,
+    side: int,
+    stamp_ns: int,
+    position: Vector,
+    restarts: bool,
+) -> None:
+    """Filter a sample (3,) [m] of one hand that has the newest stamp and was made now.
+
+    The filter starts anew if the sample `restarts` it (a confirmed jump), or if no sample is
+    retained.
+    """
+    ticks = -1
+    if state.kept[side] > 0:
+        ticks = state.tick - state.kept_ticks[side, slot(state, side, 0)]
+    insert(state, side, 0, stamp_ns, state.tick, position, restarts)
+    filter_in(state, config, side, slot(state, side, 0), ticks)
+
+
+@compiled
+def insert(
+    state: Struct,
+    side: int,
+    order: int,
+    stamp_ns: int,
+    tick: int,
+    position: Vector,
+    restarts: bool,
+) -> None:
+    """Insert a sample (3,) [m] into a hand's ring as number `order`; `restarts` marks that the
+    filter starts anew with it. The filter's states in the ring are not moved: `filter_in` writes
+    them again.
+    """
+    state.kept_newest[side] = (state.kept_newest[side] + 1) % KEPT
+    state.kept[side] = min(state.kept[side] + 1, KEPT)
+    for newer in range(order):
+        new = slot(state, side, newer)
+        old = slot(state, side, newer + 1)
+        state.kept_stamps_ns[side, new] = state.kept_stamps_ns[side, old]
+        state.kept_ticks[side, new] = state.kept_ticks[side, old]
+        state.kept_late[side, new] = state.kept_late[side, old]
+        state.kept_restarts[side, new] = state.kept_restarts[side, old]
+        state.kept_positions[side, new] = state.kept_positions[side, old]
+    index = slot(state, side, order)
+    state.kept_stamps_ns[side, index] = stamp_ns
+    state.kept_ticks[side, index] = tick
+    state.kept_late[side, index] = state.tick - tick
+    state.kept_restarts[side, index] = restarts
+    state.kept_positions[side, index] = position
+
+
+@compiled
+def filter_in(state: Struct, config: Struct, side: int, at: int, ticks: int) -> None:
+    """Filter the retained sample at ring index `at`, and store the filter's state beside it.
+
+    The filter must have been advanced to the sample's tick, by `ticks` since the sample before; -1
+    if there is none. Then, and after a confirmed jump, the filter starts from this sample alone.
+    """
+    position = state.kept_positions[side, at]
+    interval_s = config.tracker_memory_s if ticks < 0 else ticks * config.period_s
+    if ticks < 0 or state.kept_restarts[side, at] > 0:
+        state.even_samples[side] = 0
+        _update_noise(state, config, side, position, interval_s)
+        start(state, config, side, position)
+    else:
+        _update_noise(state, config, side, position, interval_s)
+        update(state, config, side, position, interval_s)
+    _remember(state, side, at)
+
+
+@compiled
+def _update_noise(
+    state: Struct, config: Struct, side: int, position: Vector, interval_s: float
+) -> None:
+    """Update the noise variance r [m²] of one hand by a sample x_0 (3,) [m] that follows x_1, x_2,
+    x_3:
+
+        d = x_0 - 3 x_1 + 3 x_2 - x_3,   n = min(n + 1, noise_samples)
+        r = r + (min(|d|² / 60, outlier_variances r) - r) / (n + 1)
+
+    60 = 3 axes * (1 + 9 + 9 + 1). r is at least least_noise_m². Only evenly spaced samples are
+    used: when an interval differs by more than half from the one before, this sample and the next
+    do not change r.
+    """
+    history = state.past_samples[side]
+    count = state.even_samples[side]
+    before_s = state.sample_interval_s[side]
+    if count >= 2 and abs(interval_s - before_s) > 0.5 * before_s:
+        count = 1
+    state.sample_interval_s[side] = interval_s
+    if count >= 3:
+        variance = state.noise_variance[side]
+        third = position - 3.0 * history[0] + 3.0 * history[1] - history[2]
+        sample_variance = min(square(third) / 60.0, config.outlier_variances * variance)
+        samples = min(state.noise_samples[side] + 1, config.noise_samples)
+        state.noise_samples[side] = samples
+        variance += (sample_variance - variance) / (samples + 1.0)
+        state.noise_variance[side] = max(variance, config.least_noise_m**2)
+    history[2] = history[1]
+    history[1] = history[0]
+    history[0] = position
+    state.even_samples[side] = min(count + 1, 3)
+
+
+@compiled
+def _remember(state: Struct, side: int, at: int) -> None:
+    """Store the complete state of one hand's filter at ring index `at`."""
+    state.kept_means[side, at] = state.mode_means[side]
+    state.kept_covariances[side, at] = state.mode_covariances[side]
+    state.kept_probabilities[side, at] = state.mode_probabilities[side]
+    state.kept_past[side, at] = state.past_samples[side]
+    noise = state.kept_noise[side, at]
+    noise[0] = state.noise_variance[side]
+    noise[1] = state.noise_samples[side]
+    noise[2] = state.even_samples[side]
+    noise[3] = state.sample_interval_s[side]
+
+
+@compiled
+def settle(
+    state: Struct, config: Struct, models: Records, side: int, stamp_ns: int, fresh: bool
+) -> None:
+    """Update the tracker's clock, the tremor and the estimate of one hand after a sample was
+    filtered.
+    """
+    note_clock(state, config, side, stamp_ns, fresh)
+    if state.kept[side] > SETTLED_SAMPLES:
+        note_tremor(state, config, models, side, slot(state, side, SETTLED_SAMPLES))
+    estimate(state, config, models, side)

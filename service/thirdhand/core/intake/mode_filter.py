@@ -31,7 +31,7 @@ from kmp.elementary import exp, log
 from thirdhand.core.frame import Struct, Vector
 from thirdhand.core.intake import MODES, STATES
 from thirdhand.core.intake.motion_model import CHANGE, ENDLESS, REACH, STEADY
-from thirdhand.core.vectors import dot, square
+from thirdhand.core.vectors import dot, square, squared_amplitude
 
 
 @compiled
@@ -276,16 +276,18 @@ def _mix(  # noqa: C901, PLR0912 - one nest of loops
         for i in range(MODES):
             expected[j] += shares[i, j]
         for i in range(MODES):
+            share = shares[i, j] / expected[j]
             for a in range(STATES):
                 for axis in range(3):
-                    mean[a, axis] += shares[i, j] / expected[j] * of_means[j, i, a, axis]
+                    mean[a, axis] += share * of_means[j, i, a, axis]
         for i in range(MODES):
+            share = shares[i, j] / expected[j]
             deviations = of_means[j, i]
             deviations -= mean
             for a in range(STATES):
                 for b in range(a, STATES):
                     variance = of_covariances[j, i, a, b] + dot(deviations[a], deviations[b]) / 3.0
-                    covariance[a, b] += shares[i, j] / expected[j] * variance
+                    covariance[a, b] += share * variance
 
 
 @compiled
@@ -297,17 +299,8 @@ def _beyond_calm(config: Struct, mean: Vector, tremor: Vector, mode: int) -> flo
     with σ_v = calm_speed_stds_mps, y_max = max_tremor_m and the tremor's σ.
     """
     speed = square(mean[1]) / config.calm_speed_stds_mps[mode] ** 2
-    beyond_m2 = max(amplitude(mean, tremor[0]) - config.max_tremor_m**2, 0.0)
+    beyond_m2 = max(squared_amplitude(mean[3], mean[4], tremor[0]) - config.max_tremor_m**2, 0.0)
     return float(max(speed - config.outlier_variances, 0.0) + beyond_m2 / tremor[1 + mode])
-
-
-@compiled
-def amplitude(mean: Vector, rate: float) -> float:
-    """Squared amplitude |y|² + |w|² / ω² [m²] of the tremor in a mean (STATES, 3)."""
-    square_m2 = 0.0
-    for axis in range(3):
-        square_m2 += mean[3, axis] ** 2 + (mean[4, axis] / rate) ** 2
-    return square_m2
 
 
 @compiled

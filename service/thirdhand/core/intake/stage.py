@@ -1,12 +1,11 @@
 """Intake of hand and arm samples: check them, map them to frame `base`, and filter them to a state
 at the tick. The clutch, the wish for the gripper and reports of hand guiding are taken in here too.
 
-`step` states all rules by which samples are accepted; `retained_samples` filters late ones too.
+`step` states all rules by which samples are accepted; `late_samples` filters late ones.
 """
 
 from __future__ import annotations
 
-import contextlib
 import math
 from typing import NamedTuple, TypeAlias
 
@@ -107,7 +106,7 @@ class Intake:
             longest_late_s=longest_late_s,
             unseen_ticks=unseen_ticks,
             silent_ticks=_stale_ticks("joints/state", settings),
-            # for so long an arm must report one posture before it is accepted as at rest
+            # an arm is at rest once it has reported one posture for this time
             still_ticks=settings.ticks_in(numbers.max_late_s),
             joint_jump_speed=float((np.array(joints.velocity) / per_rad).max()),
             plausible_joints=limits + numbers.max_outside_rad * per_rad * np.array([[-1.0], [1.0]]),
@@ -125,7 +124,7 @@ class Intake:
             jump_noise_stds=2.0 * numbers.outlier_stds,  # twice, as the prediction is uncertain too
             arm_still_rad=numbers.arm_still_rad,
             confirmed_s=numbers.confirmed_s,
-            # 1 %, the largest drift between two clocks
+            # clocks drift apart by at most 1 %
             delay_tolerance_s=0.01 * numbers.tracker_memory_s,
             contested_off_share=numbers.contested_off_share,
             max_joint_radps=numbers.max_joint_radps,
@@ -147,8 +146,9 @@ class Intake:
 
     def begin(self, state: Record) -> None:
         """Set the values that hold before the first sample, in a state of zeros."""
-        of_hands = ("hand_ticks", "clock_tick", "memory_ticks")
-        for field in ("tick", *of_hands, "arm_tick", "arm_still_tick", "arm_sample_ticks"):
+        for field in ("tick", "hand_ticks", "clock_tick", "memory_ticks"):
+            state[field] = -1
+        for field in ("arm_tick", "arm_still_tick", "arm_sample_ticks"):
             state[field] = -1
         state["stale_ticks"] = self.parameters["stale_ticks"][0]
         self._estimator.begin(state)
@@ -163,8 +163,8 @@ class Intake:
                 case "joints/state":
                     self.take_arm(state, event.value)
                 case "clutch" | "joints/guided":
-                    field, ticks = self._holding[event.kind]
-                    state[field] = state["tick"] + ticks if event.value else 0
+                    field, lasting_ticks = self._holding[event.kind]
+                    state[field] = state["tick"] + lasting_ticks if event.value else 0
                 case "gripper/wish":
                     state["gripper_wish"] = event.value
                 case _:
@@ -198,9 +198,12 @@ class Intake:
 
     def take_arm(self, state: Record, sample: JointState) -> None:
         """Store a sample of the arm in the state, or count it as rejected."""
-        cause = int(Cause.INCOMPLETE)
-        with contextlib.suppress(WireError):
-            motion = map(np.array, measured(sample, self._names))
+        try:
+            position, velocity = measured(sample, self._names)
+        except WireError:
+            cause = int(Cause.INCOMPLETE)
+        else:
+            motion = np.array(position), np.array(velocity)
             cause = take_arm(as_array(state), self.parameters, sample.stamp_ns, *motion)
         if cause >= 0:
             newest_ns = int(state["arm_stamp_ns"])

@@ -40,28 +40,27 @@ from thirdhand.core.codes import (
     UNSEEN,
 )
 from thirdhand.core.frame import Records, Struct, Vector
-from thirdhand.core.intake import CONFIRMED_SAMPLES, KEPT, SETTLED_SAMPLES
+from thirdhand.core.intake import CONFIRMED_SAMPLES, KEPT
 from thirdhand.core.intake.arm_samples import compared, unwrap
-from thirdhand.core.intake.hand_estimator import (
-    estimate,
-    goes_on,
-    is_fresh,
-    note_clock,
-    slot,
-    ticks_late,
-    turn_to,
-)
-from thirdhand.core.intake.retained_samples import (
+from thirdhand.core.intake.hand_estimator import is_fresh, settle, slot, take, ticks_late
+from thirdhand.core.intake.late_samples import (
     drop,
     expected,
     order_of,
-    take,
     take_late,
     tick_made,
     wrong_samples,
 )
-from thirdhand.core.intake.tremor import note_tremor
-from thirdhand.core.vectors import distance, rounded, square, squared_distance, transform
+from thirdhand.core.intake.motion_model import CHANGE
+from thirdhand.core.vectors import (
+    add_product,
+    distance,
+    norm,
+    rounded,
+    square,
+    squared_distance,
+    transform,
+)
 
 
 @compiled
@@ -186,6 +185,21 @@ def _malformed(
 
 
 @compiled
+def _goes_on(state: Struct, config: Struct, side: int, position: Vector) -> bool:
+    """True if a hand that is seen again at x (3,) [m] continues its filter: its newest sample is
+    less than `unseen_ticks` old, and |x - p|² < outlier_variances (P + r).
+
+    p is the estimated position, P the position's variance in the mode CHANGE, r the noise variance.
+    """
+    square_m2 = squared_distance(position, state.hands[side, 0])
+    variance = state.mode_covariances[side, CHANGE, 0, 0] + state.noise_variance[side]
+    return bool(
+        is_fresh(state, side, config.unseen_ticks)
+        and square_m2 < config.outlier_variances * variance
+    )
+
+
+@compiled
 def _in_time(
     state: Struct, config: Struct, side: int, stamp_ns: int, in_base: Vector, fresh: bool
 ) -> tuple[int, int, int]:
@@ -204,7 +218,7 @@ def _in_time(
     if cause >= 0:
         return cause, 0, state.tick
 
-    if not fresh and (stamp_ns < newest_ns or not goes_on(state, config, side, in_base)):
+    if not fresh and (stamp_ns < newest_ns or not _goes_on(state, config, side, in_base)):
         state.kept[side] = 0
     elif fresh and stamp_ns < newest_ns:
         order = order_of(state, side, stamp_ns)
@@ -214,6 +228,8 @@ def _in_time(
         return OLDER, 0, state.tick
     if order < 0:
         return REPEATED, order, state.tick
+    if order == 0 and late == 0:
+        return -1, 0, state.tick
     return -1, order, tick_made(state, side, stamp_ns, order, late, period_s)
 
 
@@ -242,8 +258,11 @@ def _jump(
     if not fresh:
         return False, 0
     # predicted from the sample before it, by stamp
-    prediction = expected(state, models, side, order, made)
-    neighbour = slot(state, side, min(order, state.kept[side] - 1))
+    prediction = state.hands[side, 0]
+    neighbour = state.kept_newest[side]
+    if order > 0 or made != state.tick:
+        prediction = expected(state, models, side, order, made)
+        neighbour = slot(state, side, min(order, state.kept[side] - 1))
     interval_s = abs(made - state.kept_ticks[side, neighbour]) * config.period_s
     gate_m = max(
         config.jump_m + config.jump_speed_mps * interval_s,
@@ -338,23 +357,44 @@ def take_hand(
     before = state.hands[side, 0].copy()
     if wrong > 0:
         drop(state, side, wrong)
-    note_clock(state, config, side, stamp_ns, fresh)
     if order == 0 and made_tick == state.tick and wrong == 0:
         take(state, config, side, stamp_ns, in_base, jumped)
     else:
         take_late(state, config, models, side, stamp_ns, made_tick, in_base, jumped)
-    if state.kept[side] > SETTLED_SAMPLES:
-        note_tremor(state, config, models, side, slot(state, side, SETTLED_SAMPLES))
-    estimate(state, config, models, side)
+    settle(state, config, models, side, stamp_ns, fresh)
 
     # The newest sample is what later ones are compared with.
     if order == 0:
         _note_correction(state, config, side, wrong, before)
         state.jump_count[side] = 0
-        turn_to(state, side, turn, mapping)
+        _turn_to(state, side, turn, mapping)
         state.hand_stamps_ns[side] = stamp_ns
         state.hand_ticks[side] = state.tick
     return -1
+
+
+@compiled
+def _turn_to(
+    state: Struct, side: int, turn: tuple[float, float, float, float], mapping: Vector
+) -> None:
+    """Store the orientation of one hand as a rotation matrix in frame base, row by row.
+
+    `turn` is the quaternion x y z w in the tracker's axes. `mapping` (3, 4) maps the tracker's
+    coordinates to base: rotation times unit [m], and origin.
+    """
+    x, y, z, w = turn
+    s = 2.0 / (x * x + y * y + z * z + w * w)
+    rotation = np.array(
+        (
+            (1.0 - s * (y * y + z * z), s * (x * y - z * w), s * (x * z + y * w)),
+            (s * (x * y + z * w), 1.0 - s * (x * x + z * z), s * (y * z - x * w)),
+            (s * (x * z - y * w), s * (y * z + x * w), 1.0 - s * (x * x + y * y)),
+        )
+    )
+    unit = norm(mapping[:, 0])
+    turned = state.hand_turns[side].reshape((3, 3))
+    turned[:] = 0.0
+    add_product(mapping[:, :3] / unit, rotation, turned)
 
 
 @compiled

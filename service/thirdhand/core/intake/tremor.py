@@ -17,9 +17,9 @@ from kmp.compiled import compiled
 from kmp.elementary import exp, log
 from thirdhand.core.frame import Records, Struct, Vector
 from thirdhand.core.intake import BANK, NO_TREMOR, USUAL_RATE
-from thirdhand.core.intake.mode_filter import amplitude, measure, move_on
+from thirdhand.core.intake.mode_filter import measure, move_on
 from thirdhand.core.intake.motion_model import CHANGE, ENDLESS, REST
-from thirdhand.core.vectors import rounded
+from thirdhand.core.vectors import rounded, squared_amplitude
 
 
 @compiled
@@ -78,7 +78,7 @@ def note_tremor(state: Struct, config: Struct, models: Records, side: int, at: i
         evidence[k] = rounded(evidence[k] * fade + likelihood - null)
         if k >= NO_TREMOR:
             strength = state.bank_variances[side, rate]
-            sample_m2 = amplitude(mean, config.tremor_rates_per_s[rate])
+            sample_m2 = squared_amplitude(mean[3], mean[4], config.tremor_rates_per_s[rate])
             strength += (1.0 - fade) * (min(sample_m2, config.max_tremor_m**2) - strength)
             state.bank_variances[side, rate] = strength
     _choose(state, config, side)

@@ -27,9 +27,9 @@ import numpy as np
 from kmp.compiled import compiled
 from thirdhand.core.codes import (
     ACCELERATION_BOUND,
-    FINITE_BOUND,
     JERK_BOUND,
     NO_BOUND,
+    NOT_FINITE_BOUND,
     POSITION_BOUND,
     SPEED_BOUND,
 )
@@ -52,8 +52,9 @@ def remember(hull: Vector, ticks: int, position: Vector, span_ticks: int) -> int
     Returns the number of targets in the newest span.
     """
     if 0 < ticks < span_ticks:
-        hull[0, 0] = np.minimum(hull[0, 0], position)
-        hull[0, 1] = np.maximum(hull[0, 1], position)
+        for axis in range(3):
+            hull[0, 0, axis] = min(hull[0, 0, axis], position[axis])
+            hull[0, 1, axis] = max(hull[0, 1, axis], position[axis])
         return ticks + 1
     if ticks > 0:
         for span in range(HULL_SPANS - 1, 0, -1):
@@ -102,7 +103,7 @@ def broken_bound(
     max_speed = config.max_speed
     longest_stop = config.longest_stop
     if not np.isfinite(setpoint).all():
-        return FINITE_BOUND
+        return NOT_FINITE_BOUND
     if (
         norm(setpoint[1])
         > max(max_speed, speed_to_come(before[1], before[2], config.stop_jerk, 0.0)) + 1e-9
@@ -130,12 +131,13 @@ def take_safe(  # noqa: C901, PLR0912 - a case for each bound
     config: Struct,
     costs: Vector,
     slow: float,
-    low: Vector,
-    high: Vector,
+    hull: Vector,
+    box: Vector,
 ) -> bool:
     """Move a setpoint (3, 3) to `ahead` (3, 3) if a stop from there keeps every bound.
 
-    The step is accepted if N(ahead) <= V and, on each side of each axis with the bound H,
+    The step is accepted if N(ahead) <= V and, on each side of each axis with the bound H of
+    `bounds`,
 
         top(ahead) <= H,    or    top(setpoint) > H  and  P(ahead) <= P(setpoint) - σ ρ dt,
 
@@ -158,6 +160,9 @@ def take_safe(  # noqa: C901, PLR0912 - a case for each bound
         for joint in range(costs.shape[2]):
             max_joint_cost = max(max_joint_cost, abs(costs[0, i, joint]))
     required_return_m = return_speed * slow / max(1.0, max_joint_cost * max_speed) * config.period_s
+    low = np.empty(3)
+    high = np.empty(3)
+    bounds(hull, box, config, low, high)
 
     is_kept = True
     is_mixed = False

@@ -13,7 +13,6 @@ from thirdhand.core.kinematics import joint_costs
 from thirdhand.core.numerics import LEAST_SPEED_MPS
 from thirdhand.core.setpoint.bounds import (
     between,
-    bounds,
     broken_bound,
     remember,
     stopping,
@@ -72,14 +71,11 @@ def lead(
     config = parameters[0]
     setpoint = state.setpoint
     target = np.empty((3, 3))
-    low = np.empty(3)
-    high = np.empty(3)
     before = setpoint.copy()
     target[0] = position
     target[1] = velocity
     target[2] = acceleration
     state.hull_ticks = remember(state.hull, state.hull_ticks, position, config.span_ticks)
-    bounds(state.hull, box, config, low, high)
 
     jerk = np.empty(3)
     ahead = np.empty((3, 3))
@@ -94,7 +90,7 @@ def lead(
         ahead[1, i] = v + dt * (a + dt * j / 2.0)
         ahead[2, i] = a + dt * j
 
-    if not take_safe(setpoint, ahead, config, costs, slow, low, high):
+    if not take_safe(setpoint, ahead, config, costs, slow, state.hull, box):
         met = STOPPED
     if broken_bound(setpoint, before, state.hull, box, config):
         setpoint[:] = before

@@ -20,10 +20,10 @@ from thirdhand.core.skill.tuning import (
     GRIPPER_OPEN_BELOW,
     GRIPPER_THERE_M,
 )
+from thirdhand.core.vectors import add_product, round_to, rounded, square, times
 
 if TYPE_CHECKING:
     from kmp import KMP
-from thirdhand.core.vectors import add_product, dot, round_to, rounded, times
 
 
 def decided(gripper: int, closure: float, *, since_s: float = math.inf, off: float = 0.0) -> int:
@@ -138,20 +138,20 @@ def _turned(
     part = np.zeros((3, 3))
     for i in range(3):
         vector[i] = 2.0 * rounded(zeta[i], TURN_ROUND_TO)
-    square = dot(vector, vector)
-    angle = math.sqrt(square)
+    squared_rad2 = square(vector)
+    angle = math.sqrt(squared_rad2)
 
     # factors of [φ]× and [φ]×² in J_l, then `per_zeta` = J
     first = 0.5
     second = 1.0 / 6.0
     if angle > 1e-3:
         sine, cosine = sin_cos(angle)
-        first = (1.0 - cosine) / square
-        second = (angle - sine) / (square * angle)
+        first = (1.0 - cosine) / squared_rad2
+        second = (angle - sine) / (squared_rad2 * angle)
     for i in range(3):
         for j in range(3):
             per_zeta[i, j] = 2.0 * second * vector[i] * vector[j]
-        per_zeta[i, i] += 2.0 * (1.0 - second * square)
+        per_zeta[i, i] += 2.0 * (1.0 - second * squared_rad2)
     for i in range(3):
         j = (i + 1) % 3
         k = (i + 2) % 3

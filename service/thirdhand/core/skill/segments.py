@@ -48,7 +48,7 @@ from thirdhand.core.skill.tuning import (
     UNSURE_M,
     WITH_HAND_POWER,
 )
-from thirdhand.core.vectors import ROUND_TO, dot, norm, round_to, rounded, squared_distance
+from thirdhand.core.vectors import dot, norm, round_to, rounded, squared_distance
 
 MOST_SEGMENTS = 64  # segments for which the state has room
 STAYS = 0.0  # `square` of a hand that rests
@@ -253,7 +253,7 @@ def recognise(
         belief[k] *= exp((likelihood[k] - most) * share)
         total += belief[k]
     for k in range(count):
-        belief[k] = round(belief[k] / total * ROUND_TO) / ROUND_TO
+        belief[k] = rounded(belief[k] / total)
 
 
 @compiled
@@ -545,7 +545,6 @@ def elsewhere(
         return 0.0
     recognise(unprimed, now, period_s, segments, 1.0)
     count = len(segments)
-    most = belief[:count].argmax()
     difference = 0.0
     for k in range(count):
         difference = max(difference, abs(unprimed[k] - belief[k]))
@@ -553,6 +552,7 @@ def elsewhere(
         unprimed[0] = UNPRIMED_DECIDED
         return 0.0
 
+    most = belief[:count].argmax()
     # the tools of segment k and of all that are probable without a first segment
     either = np.empty(count)
     tools = np.empty((1, count, 3))

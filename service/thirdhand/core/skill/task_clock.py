@@ -158,7 +158,7 @@ def count(
     rows: Vector,
     clock: Vector,
 ) -> bool:
-    """Advance a clock (12,) by one period `period_s` [s]; see the equations of this module. The
+    """Advance a clock (12,) by the time `period_s` [s]; see the equations of this module. The
     faster one of the hands (6,) [m] has the speed `speed` [m/s], the less still one the stillness
     `still`. Returns true if the task begins again.
 
@@ -233,15 +233,16 @@ def _follow(
 def move(states: Records, sides: NDArray[np.int64], period_s: float, rows: Vector) -> None:
     """Advance the clock in the state to this tick by `count`, in the most probable segment; memory
     and belief end where the task begins again. The speeds are those of the hands `sides` (2,)
-    without their tremor. While a hand is not seen, a clock waits, unless it is REQUESTED.
+    without their tremor. While a hand is not seen, at most MEMORY_LONGEST_STEP_S is counted, unless
+    the clock is REQUESTED.
     """
     state = states[0]
     before = state.memory_ticks.max()
-    is_free = rows[0, PACE_AT] == REQUESTED
-    if is_free:
+    starts_on_request = rows[0, PACE_AT] == REQUESTED
+    if starts_on_request:
         before = max(before, int(state.task_clock[BEGUN_TICK]))
     passed_s = period_s if before < 0 else (state.tick - before) * period_s
-    if not is_free:
+    if not starts_on_request:
         passed_s = min(passed_s, MEMORY_LONGEST_STEP_S)
 
     hands = np.empty(6)

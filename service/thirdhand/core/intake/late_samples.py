@@ -1,5 +1,5 @@
-"""Retained samples of a hand, in the order of their stamps, and their filtering, each at the tick
-in which it was made.
+"""Late and overtaken samples of a hand: the tick in which each was made, and their filtering at
+that tick.
 
 A tracker's clock is that of another machine, so its stamps only show how much longer the delay of
 one sample is than that of another. Samples with the minimum delay of the last one to two seconds
@@ -7,10 +7,6 @@ are taken to be made when they arrive; a sample with a longer delay was made ear
 difference. A tracker's clock is trusted while the minimum delays of consecutive seconds agree.
 While it is not trusted, samples are taken to be made when they arrive. Samples that overtook each
 other are always put in the order of their stamps.
-
-The newest KEPT samples of each hand are retained in rings, each with the state of the filter after
-it, so that late and overtaken ones can be inserted. `order` counts them backward from the newest,
-which is 0.
 """
 
 from __future__ import annotations
@@ -20,12 +16,18 @@ import numpy as np
 from kmp.compiled import compiled
 from thirdhand.core.codes import TRUSTED
 from thirdhand.core.frame import Records, Struct, Vector
-from thirdhand.core.intake import KEPT, MODES, SETTLED_SAMPLES
-from thirdhand.core.intake.hand_estimator import model_over, seconds_after, slot
-from thirdhand.core.intake.mode_filter import advance, start, update
+from thirdhand.core.intake import MODES, SETTLED_SAMPLES
+from thirdhand.core.intake.hand_estimator import (
+    filter_in,
+    insert,
+    model_over,
+    seconds_after,
+    slot,
+)
+from thirdhand.core.intake.mode_filter import advance
 from thirdhand.core.intake.motion_model import CHANGE
 from thirdhand.core.numerics import TICK_ROUNDING
-from thirdhand.core.vectors import square, squared_distance
+from thirdhand.core.vectors import squared_distance
 
 
 @compiled
@@ -71,9 +73,7 @@ def expected(state: Struct, models: Records, side: int, order: int, tick: int) -
     position.
     """
     out = np.zeros(3)
-    if order == 0 and tick == state.tick:
-        out[:] = state.hands[side, 0]
-    elif order == state.kept[side]:
+    if order == state.kept[side]:
         out[:] = state.kept_positions[side, slot(state, side, order - 1)]
     else:
         index = slot(state, side, order)
@@ -155,59 +155,6 @@ def drop(state: Struct, side: int, count: int) -> None:
 
 
 @compiled
-def insert(
-    state: Struct,
-    side: int,
-    order: int,
-    stamp_ns: int,
-    tick: int,
-    position: Vector,
-    restarts: bool,
-) -> None:
-    """Insert a sample (3,) [m] into a hand's ring as number `order`; `restarts` marks that the
-    filter starts anew with it. The filter's states in the ring are not moved: `_filter_in` writes
-    them again.
-    """
-    state.kept_newest[side] = (state.kept_newest[side] + 1) % KEPT
-    state.kept[side] = min(state.kept[side] + 1, KEPT)
-    for newer in range(order):
-        new = slot(state, side, newer)
-        old = slot(state, side, newer + 1)
-        state.kept_stamps_ns[side, new] = state.kept_stamps_ns[side, old]
-        state.kept_ticks[side, new] = state.kept_ticks[side, old]
-        state.kept_late[side, new] = state.kept_late[side, old]
-        state.kept_restarts[side, new] = state.kept_restarts[side, old]
-        state.kept_positions[side, new] = state.kept_positions[side, old]
-    index = slot(state, side, order)
-    state.kept_stamps_ns[side, index] = stamp_ns
-    state.kept_ticks[side, index] = tick
-    state.kept_late[side, index] = state.tick - tick
-    state.kept_restarts[side, index] = restarts
-    state.kept_positions[side, index] = position
-
-
-@compiled
-def take(
-    state: Struct,
-    config: Struct,
-    side: int,
-    stamp_ns: int,
-    position: Vector,
-    restarts: bool,
-) -> None:
-    """Filter a sample (3,) [m] of one hand that has the newest stamp and was made now.
-
-    The filter starts anew if the sample `restarts` it (a confirmed jump), or if no sample is
-    retained.
-    """
-    ticks = -1
-    if state.kept[side] > 0:
-        ticks = state.tick - state.kept_ticks[side, slot(state, side, 0)]
-    insert(state, side, 0, stamp_ns, state.tick, position, restarts)
-    _filter_in(state, config, side, slot(state, side, 0), ticks)
-
-
-@compiled
 def take_late(
     state: Struct,
     config: Struct,
@@ -239,7 +186,7 @@ def take_late(
             older_tick = state.kept_ticks[side, slot(state, side, newer + 1)]
             ticks = state.kept_ticks[side, index] - older_tick
             _advance_by(state, models, side, ticks)
-        _filter_in(state, config, side, index, ticks)
+        filter_in(state, config, side, index, ticks)
     _advance_by(state, models, side, state.tick - state.kept_ticks[side, slot(state, side, 0)])
 
 
@@ -248,73 +195,6 @@ def _advance_by(state: Struct, models: Records, side: int, ticks: int) -> None:
     """Advance all modes of one hand by some ticks; 0 ticks change nothing."""
     if ticks > 0:
         advance(state, side, model_over(models, ticks))
-
-
-@compiled
-def _filter_in(state: Struct, config: Struct, side: int, at: int, ticks: int) -> None:
-    """Filter the retained sample at ring index `at`, and store the filter's state beside it.
-
-    The filter must have been advanced to the sample's tick, by `ticks` since the sample before; -1
-    if there is none. Then, and after a confirmed jump, the filter starts from this sample alone.
-    """
-    position = state.kept_positions[side, at]
-    interval_s = config.tracker_memory_s if ticks < 0 else ticks * config.period_s
-    if ticks < 0 or state.kept_restarts[side, at] > 0:
-        state.even_samples[side] = 0
-        _update_noise(state, config, side, position, interval_s)
-        start(state, config, side, position)
-    else:
-        _update_noise(state, config, side, position, interval_s)
-        update(state, config, side, position, interval_s)
-    _remember(state, side, at)
-
-
-@compiled
-def _update_noise(
-    state: Struct, config: Struct, side: int, position: Vector, interval_s: float
-) -> None:
-    """Update the noise variance r [m²] of one hand by a sample x_0 (3,) [m] that follows x_1, x_2,
-    x_3:
-
-        d = x_0 - 3 x_1 + 3 x_2 - x_3,   n = min(n + 1, noise_samples)
-        r = r + (min(|d|² / 60, outlier_variances r) - r) / (n + 1)
-
-    60 = 3 axes * (1 + 9 + 9 + 1). r is at least least_noise_m². Only evenly spaced samples are
-    used: when an interval differs by more than half from the one before, this sample and the next
-    do not change r.
-    """
-    history = state.past_samples[side]
-    count = state.even_samples[side]
-    before_s = state.sample_interval_s[side]
-    if count >= 2 and abs(interval_s - before_s) > 0.5 * before_s:
-        count = 1
-    state.sample_interval_s[side] = interval_s
-    if count >= 3:
-        variance = state.noise_variance[side]
-        third = position - 3.0 * history[0] + 3.0 * history[1] - history[2]
-        sample_variance = min(square(third) / 60.0, config.outlier_variances * variance)
-        samples = min(state.noise_samples[side] + 1, config.noise_samples)
-        state.noise_samples[side] = samples
-        variance += (sample_variance - variance) / (samples + 1.0)
-        state.noise_variance[side] = max(variance, config.least_noise_m**2)
-    history[2] = history[1]
-    history[1] = history[0]
-    history[0] = position
-    state.even_samples[side] = min(count + 1, 3)
-
-
-@compiled
-def _remember(state: Struct, side: int, at: int) -> None:
-    """Store the complete state of one hand's filter at ring index `at`."""
-    state.kept_means[side, at] = state.mode_means[side]
-    state.kept_covariances[side, at] = state.mode_covariances[side]
-    state.kept_probabilities[side, at] = state.mode_probabilities[side]
-    state.kept_past[side, at] = state.past_samples[side]
-    noise = state.kept_noise[side, at]
-    noise[0] = state.noise_variance[side]
-    noise[1] = state.noise_samples[side]
-    noise[2] = state.even_samples[side]
-    noise[3] = state.sample_interval_s[side]
 
 
 @compiled
