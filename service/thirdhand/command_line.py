@@ -12,11 +12,10 @@ import importlib
 import os
 
 from thirdhand.cli.options import RUN_TIME
-from thirdhand.cli.usage import AddCommand, Parser, UsageError, reaching
+from thirdhand.cli.usage import AddCommand, Parser, reaching
 from thirdhand.contract.explain import ExplainedError, in_file, in_words
 from thirdhand.process import foreign_modules, interrupt
 from thirdhand.process.progress import say
-from thirdhand.settings.file_content import SettingsError, UnreadableError
 from thirdhand.workbench.cli.options import WORKBENCH
 
 GROUPS = {
@@ -80,14 +79,11 @@ def main(arguments: list[str] | None = None) -> int:
                 else contextlib.nullcontext()
             ):
                 return int(run(args))
-    except (UsageError, SettingsError) as error:
-        say(f"thirdhand {args.command}: {in_file(str(error))}")
-        return 1 if isinstance(error, UnreadableError) else 2
     except BrokenPipeError:  # the reader of standard output, a pager for instance, has ended
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         return 1
     except (ExplainedError, OSError) as error:
         say(f"thirdhand {args.command}: {in_file(in_words(error))}")
-        return 1
+        return error.exit_code if isinstance(error, ExplainedError) else 1
     except KeyboardInterrupt:
         interrupt.end_at_once()

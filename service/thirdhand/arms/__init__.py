@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from thirdhand.contract.explain import ExplainedError
+from thirdhand.contract.explain import ExplainedError, NotAcceptedError
 
 DRIVE_PERIOD_S = (0.0005, 0.02)
 LAG_S = (0.0, 0.5)
@@ -23,14 +23,14 @@ class DriveError(ExplainedError, RuntimeError):
 
 def place_of(name: str) -> str:
     """The place, MODULE:CLASS or FILE.py:CLASS, of an arm of this name, or which is this place.
-    Raises DriveError.
+    Raises NotAcceptedError.
     """
     from importlib.metadata import entry_points  # slow to import
 
     known = SHIPPED | {entry.name: entry.value for entry in entry_points(group=GROUP)}
     place = known.get(name, name)
     if ":" not in place:
-        raise DriveError(
+        raise NotAcceptedError(
             f"no arm {name!r}; {', '.join(known)} accepted, or one of your own as MODULE:CLASS or "
             "FILE.py:CLASS"
         )

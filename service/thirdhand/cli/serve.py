@@ -24,7 +24,7 @@ from thirdhand.process import child, foreign_modules
 from thirdhand.process.priority import ahead_of_others
 from thirdhand.recordings.shipped import cell_of, skill_file
 from thirdhand.settings.config import Settings, converted
-from thirdhand.settings.file_content import SettingsError, UnreadableError
+from thirdhand.settings.file_content import SettingsError
 
 log = logging.getLogger("thirdhand")
 
@@ -50,12 +50,7 @@ def serve(args: argparse.Namespace) -> int:
             in_file(in_words(error)),
             exc_info=not isinstance(error, OSError | ValueError | ExplainedError),
         )
-        return (
-            2
-            if isinstance(error, UsageError | SettingsError)
-            and not isinstance(error, UnreadableError)
-            else 1
-        )
+        return error.exit_code if isinstance(error, ExplainedError) else 1
 
 
 def _run(args: argparse.Namespace) -> int:

@@ -25,7 +25,7 @@ from thirdhand.client import (
     open_session,
 )
 from thirdhand.contract.channels import ENDPOINT, LARGEST_REQUEST, lacking
-from thirdhand.contract.explain import did_you_mean, in_file, in_words
+from thirdhand.contract.explain import NotAcceptedError, did_you_mean, in_file, in_words
 from thirdhand.contract.requests import Add, RequestError, ViaPoint, decode_request
 from thirdhand.settings.config import RATES_HZ, Settings
 from thirdhand.settings.file_content import UnusableError, content
@@ -33,7 +33,7 @@ from thirdhand.settings.file_content import UnusableError, content
 CONNECT_TIMEOUT_S = 3.0
 
 
-class UsageError(ValueError):
+class UsageError(NotAcceptedError):
     """The command line is not valid."""
 
 

@@ -6,7 +6,7 @@ import difflib
 import errno
 import re
 from collections.abc import Iterable
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import msgspec
 from msgspec import inspect
@@ -32,8 +32,17 @@ T = TypeVar("T")
 
 class ExplainedError(Exception):
     """An error whose message says what failed, what was given and what is accepted. Commands print
-    the message and exit with 1.
+    the message.
     """
+
+    exit_code: ClassVar[int] = 1
+    """Of commands."""
+
+
+class NotAcceptedError(ExplainedError, ValueError):
+    """A command line or configuration is not accepted."""
+
+    exit_code = 2
 
 
 def in_words(error: BaseException, *, named: bool = True) -> str:

@@ -14,7 +14,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, TypeAlias, TypeVar
 
-from thirdhand.contract.explain import ExplainedError
+from thirdhand.contract.explain import ExplainedError, NotAcceptedError
 
 Kind = TypeVar("Kind")
 Accepted: TypeAlias = tuple[Callable[[Any], bool], str]
@@ -25,11 +25,11 @@ def own_class(place: str, kind: type[Kind]) -> type[Kind]:
     """The class at a place, which must be one of this kind. Raises ExplainedError."""
     module, _, name = place.rpartition(":")
     if not module:
-        raise ExplainedError(f"{place}: MODULE:CLASS or FILE.py:CLASS needed")
+        raise NotAcceptedError(f"{place}: MODULE:CLASS or FILE.py:CLASS needed")
     with explained(_module_name(module), place):
         found = getattr(_module(module), name)
     if not (isinstance(found, type) and issubclass(found, kind)):
-        raise ExplainedError(f"{place} is no class of thirdhand.{kind.__name__}")
+        raise NotAcceptedError(f"{place} is no class of thirdhand.{kind.__name__}")
     if missing := sorted(getattr(found, "__abstractmethods__", ())):
         raise ExplainedError(
             f"{place} has no {', '.join(missing)}, which a class of thirdhand.{kind.__name__} needs"

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from thirdhand.settings.config import WAM, Settings, converted, load
-from thirdhand.settings.file_content import UnreadableError
+from thirdhand.settings.file_content import SettingsError
 
 if TYPE_CHECKING:
     from thirdhand.skills.skill_file import StoredSkill
@@ -55,7 +55,7 @@ def cell_of(arm: str, *, rate_hz: int | None = None) -> Settings:
     if colon and path.endswith(".toml"):
         return load(Path(path), cell)
     if not Path(arm).suffix and not Path(arm).exists():
-        raise UnreadableError(
+        raise SettingsError(
             f"no arm {arm!r}: {', '.join(ARMS)}, or a cell's settings (FILE.toml) needed"
         )
     return load(Path(arm))

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from thirdhand.contract.explain import in_words
-from thirdhand.settings.file_content import SettingsError, UnusableError, content
+from thirdhand.settings.file_content import SettingsError, UnreadableError, UnusableError, content
 from thirdhand.settings.robot_xml import readable
 from thirdhand.settings.urdf import Shape, Urdf, UrdfError, UrdfJoint
 
@@ -30,7 +30,7 @@ def description(path: Path, packages: tuple[str, ...] = (), *, cover: bool = Tru
 
         return covered(text, path, packages)
     except OSError as error:
-        raise SettingsError(
+        raise UnreadableError(
             f"[arm] urdf: cannot read {path}: {in_words(error, named=False)}"
         ) from None
     except UrdfError as error:

@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from thirdhand.contract.explain import ExplainedError
+from thirdhand.contract.explain import ExplainedError, NotAcceptedError
 
 if sys.version_info >= (3, 11):  # noqa: UP036, as the client alone runs on 3.10 too
     import tomllib
@@ -28,12 +28,14 @@ class UnusableError(ExplainedError, ValueError):
     """A file cannot be used; the message has the cause."""
 
 
-class SettingsError(ExplainedError, ValueError):
+class SettingsError(NotAcceptedError):
     """A configuration cannot be used; the message has the field, its value, and accepted values."""
 
 
 class UnreadableError(SettingsError):
     """A file with settings cannot be read."""
+
+    exit_code = 1
 
 
 def content(path: Path, largest_bytes: int, *, accepts_pipes: bool = False) -> bytes:
