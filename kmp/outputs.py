@@ -197,15 +197,12 @@ class Mapped(Expansion):
         self.weights  # noqa: B018
         return self
 
-    def posterior_covariance_one(self, row: Array, prior: Array | None = None) -> Array:
-        inner = self.inner.posterior_covariance_one(row, prior)
-        outputs = len(self.t)
-        blocks = inner.reshape(-1, outputs, len(inner) // outputs, outputs)
-        mapped = np.einsum("io,aobp,jp->aibj", self.t, blocks, self.t, optimize=True)
-        return np.asarray(mapped.reshape(inner.shape))
-
-    def posterior_covariance(self, rows: Array) -> Array:
-        return np.asarray(self.t @ self.inner.posterior_covariance(rows) @ self.t.T)
+    def posterior_covariance(self, rows: Array, prior: Array) -> Array:
+        inner = self.inner.posterior_covariance(rows, prior)
+        queries = len(prior) // self.hyperparameters.kernel.channels
+        blocks = inner.reshape(-1, queries, len(self.t), queries, len(self.t)).swapaxes(2, 3)
+        mapped = self.t @ blocks @ self.t.T
+        return np.asarray(mapped.swapaxes(2, 3).reshape(inner.shape))
 
     def adapted(self, changes: Changes) -> Mapped:
         points = inside(self.inner.hyperparameters, changes.functionals, self.t, changes.points)
@@ -257,21 +254,13 @@ class Decoupled(Expansion):
         self.weights  # noqa: B018
         return self
 
-    def posterior_covariance_one(self, row: Array, prior: Array | None = None) -> Array:
+    def posterior_covariance(self, rows: Array, prior: Array) -> Array:
         outputs = self.hyperparameters.outputs
-        queries = 1 if prior is None else len(prior) // self.hyperparameters.kernel.channels
-        out = np.zeros((queries * outputs, queries * outputs))
+        queries = len(prior) // self.hyperparameters.kernel.channels
+        out = np.zeros((len(rows) // len(prior), queries * outputs, queries * outputs))
         for part, group in zip(self.parts, self.groups, strict=True):
             mine = (np.arange(queries)[:, None] * outputs + group).ravel()
-            out[np.ix_(mine, mine)] = part.posterior_covariance_one(row, prior)
-        return out
-
-    def posterior_covariance(self, rows: Array) -> Array:
-        outputs = self.hyperparameters.outputs
-        queries = len(rows) // self.hyperparameters.kernel.channels
-        out = np.zeros((queries, outputs, outputs))
-        for part, group in zip(self.parts, self.groups, strict=True):
-            out[:, group[:, None], group] = part.posterior_covariance(rows)
+            out[:, mine[:, None], mine] = part.posterior_covariance(rows, prior)
         return out
 
     def adapted(self, changes: Changes) -> Solution:

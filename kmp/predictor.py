@@ -89,11 +89,7 @@ class Predictor(Immutable):
         s = self._columns(real("queries", queries))
         if (mean_and_row := self._compiled_mean(s)) is not None:
             return mean_and_row[0]
-        s = self._checked_many(s)
-        if len(s) == 1:
-            query = self.inner.query
-            return query.mean(s[0], query.row(s[0]))[None]
-        return mean_at(self.inner.solution, s)
+        return mean_at(self.inner.solution, self._checked_many(s))
 
     def predict(self, queries: ArrayLike) -> Gaussians:
         """xi(s) with its covariance at queries (M, I): M normals.
@@ -108,13 +104,10 @@ class Predictor(Immutable):
         if compiled is not None and (mean_and_row := self._compiled_mean(s)) is not None:
             return unchecked(mean_and_row[0], compiled.covariance(mean_and_row[1])[None])
         s = self._checked_many(s)
-        if len(s) == 1:
-            query = self.inner.query
-            row = query.row(s[0])
-            return unchecked(query.mean(s[0], row)[None], query.covariance(row)[None])
-        batches = [s[i : i + BLOCK] for i in range(0, len(s), BLOCK)]
+        prior = self.kernel.prior_variance
         posterior = [
-            self.inner.solution.posterior_covariance(self._rows(batch)) for batch in batches
+            self.inner.solution.posterior_covariance(self._rows(s[i : i + BLOCK]), prior)
+            for i in range(0, len(s), BLOCK)
         ]
         stacked = (
             np.concatenate(posterior) if posterior else np.empty((0, self.outputs, self.outputs))
@@ -130,8 +123,8 @@ class Predictor(Immutable):
         s = self._checked_many(queries)
         if len(s) == 0:
             raise ValueError("queries: none given, at least 1 needed.")
-        posterior = self.inner.solution.posterior_covariance_one(self._rows(s), self.kernel(s, s))
-        return unchecked(self.mean(s).reshape(1, -1), self._scaled(posterior[None]))
+        posterior = self.inner.solution.posterior_covariance(self._rows(s), self.kernel(s, s))
+        return unchecked(self.mean(s).reshape(1, -1), self._scaled(posterior))
 
     def sample(self, queries: ArrayLike, count: int, *, seed: Seed = 0) -> Array:
         """Trajectories through queries (M, I), drawn from `predict_joint`: (count, M, O).

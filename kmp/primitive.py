@@ -328,7 +328,7 @@ class KMP(Predictor, Plotted, Saved):
         nearest = self.base.inner.solution.database.nearest(points, tolerance, self.kernel.period)
         remaining = ~before.near(points, tolerance, self.kernel.period)
         return Changes(
-            frozen(np.union1d(before.replaced, nearest)) if len(nearest) else before.replaced,
+            frozen(np.unique(np.concatenate([before.replaced, *nearest]))),
             Functionals.concatenated([before.functionals.take(remaining), points]),
             Gaussians.concatenated([before.points.take(remaining), desired]),
         )
@@ -601,11 +601,9 @@ class Alternatives(Sequence[KMP]):
         check_resolved(solution.hyperparameters, added, both=is_low_rank)
         if is_low_rank:
             check_resolved(solution.hyperparameters, added, name="lambda_mean", both=True)
-        period = self._primitive.kernel.period
-        replaced = [
-            solution.database.nearest(Functionals(via), self._tolerance, period)
-            for via in self._inputs
-        ]
+        nearest = solution.database.nearest(points, self._tolerance, self._primitive.kernel.period)
+        v = len(points) // len(self)
+        replaced = [np.unique(np.concatenate(nearest[v * g :][:v])) for g in range(len(self))]
         means = moved_means(solution, added, replaced, functionals)
         means += mean_of(solution, functionals)
         for n in np.flatnonzero(np.isnan(means).any(axis=(1, 2))):
