@@ -185,15 +185,6 @@ class Dense(Expansion):
             return Dense(self.hyperparameters, database, self, first)
         return Dense(self.hyperparameters, database)
 
-    def extended(self, database: Database) -> Dense:
-        """The solution of a database that begins with this one: the factors get a border."""
-        bordered = Dense(self.hyperparameters, database, self, len(self.database))
-        factors = {
-            "_mean_solver": bordered.mean_factor,
-            "_covariance_solver": bordered.covariance_factor,
-        }
-        return Dense(self.hyperparameters, database)._with_cached(**factors).solved()  # noqa: SLF001 (of its own kind)
-
     def with_hyperparameters(self, hyperparameters: Hyperparameters) -> Dense:
         return Dense(hyperparameters, self.database)
 

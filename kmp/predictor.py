@@ -24,7 +24,7 @@ from kmp.low_rank import Features
 from kmp.problem.database import Changes, Database
 from kmp.problem.hyperparameters import AffineMean
 from kmp.query import MotionPrediction, Query
-from kmp.solution import BLOCK, Solution, least_of_channels, mean_at
+from kmp.solution import BLOCK, Solution, mean_at
 
 _RESIDUAL = 1e-10  # residual of the features, as a share of k(s, s), in the uncertainty by distance
 
@@ -149,7 +149,7 @@ class Predictor(Immutable):
 
         The input's velocity v (I,) [unit of the inputs / s] and acceleration a (I,) [unit of the
         inputs / s^2] give those of the output: J v, and J a + d^2 xi(s + t v)/dt^2. The numbers are
-        those of `jacobian` and `curvature`, and to rounding those of `predict`. The covariance
+        those of `jacobian`, and to rounding those of `predict`. The covariance
         takes longer than all else, and can be left out.
 
         Raises ValueError if a shape differs or a number is not finite.
@@ -183,16 +183,6 @@ class Predictor(Immutable):
         batches = [self.inner.query.jacobians(s[a : a + BLOCK]) for a in range(0, len(s), BLOCK)]
         return np.concatenate(batches) if batches else np.empty((0, self.outputs, self._dimensions))
 
-    def curvature(self, query: ArrayLike, direction: ArrayLike) -> Array:
-        """d^2 xi(s + t v)/dt^2 at t = 0, for one query s (I,) and a direction v (I,): (O,).
-
-        The second derivative of equation (8). If v is the velocity of the input [unit of the
-        inputs / s], this is the output's acceleration [unit of the outputs / s^2] at constant v.
-        Raises ValueError if a shape differs or a number is not finite.
-        """
-        v = self._checked("direction", direction)
-        return self.predict_motion(query, v, 0 * v, covariance=False).curvature
-
     def uncertainty(self, queries: ArrayLike) -> Uncertainty:
         """The covariance at queries (M, I), by its causes: differing demonstrations, distance.
 
@@ -224,17 +214,6 @@ class Predictor(Immutable):
     def lambda_covariance(self) -> float:
         """lambda of the covariance [1 / (unit of the outputs)^2]."""
         return self.inner.solution.hyperparameters.lambda_covariance
-
-    @property
-    def least_variance(self) -> float:
-        """Least variance of a via-point's values that rounding does not hide [unit of outputs^2].
-
-        With a `VelocityKernel`, that of a rate is 2 ell times larger. `adapt` raises ValueError for
-        smaller variances.
-        """
-        solution: Solution = self.inner.solution
-        variances = solution.hyperparameters.prior_variances
-        return float(least_of_channels(solution)[0] * variances.max())
 
     @property
     def prior_mean(self) -> Array | AffineMean:

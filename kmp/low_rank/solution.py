@@ -178,9 +178,7 @@ class LowRank(Expansion):
 
     def whitened(self, rows: Array, channels: int) -> tuple[Array, Array]:
         """The features (M, r, C) of M queries' kernel rows, and L^-1 times these (M, r D, O)."""
-        z = self.features.of_kernel(
-            rows[:, : len(self.centres) * self.features.kernel.channels]
-        )
+        z = self.features.of_kernel(rows[:, : len(self.centres) * self.features.kernel.channels])
         features = z.reshape(len(z), -1, channels).transpose(1, 0, 2)
         return features, self.inverse_factor.times(z, channels)
 
