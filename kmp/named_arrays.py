@@ -27,7 +27,6 @@ from kmp.low_rank import LowRank
 from kmp.mixture import GaussianMixture
 from kmp.orientation import OrientationKMP, PoseKMP
 from kmp.outputs import (
-    Decoupled,
     Mapped,
     as_one,
     constrained,
@@ -210,7 +209,7 @@ def _base(arrays: Mapping[str, NDArray[Any]], kinds: Mapping[str, Any]) -> BaseS
         return _weighted(_plain(parameters, database, arrays), "base_weights", arrays)
     t = numbers("output_map", arrays["output_map"], reference.outputs, reference.outputs)
     inner = _plain(*inner_problem(parameters, database, t), arrays)
-    return _weighted(Mapped(parameters, database, t, inner), "base_weights", arrays)
+    return _weighted(Mapped.around(parameters, database, t, inner), "base_weights", arrays)
 
 
 def _plain(
@@ -230,7 +229,7 @@ def _plain(
         part_arrays = {"information": information[group[0]], "features": features[:, group[:1]]}
         return LowRank.of_arrays(of, points, {**arrays, **part_arrays})
 
-    return Decoupled.of_parts(parameters, database, groups, part)
+    return Mapped.of_groups(parameters, database, groups, part)
 
 
 def _changes(arrays: Mapping[str, NDArray[Any]], database: Database) -> Changes:
