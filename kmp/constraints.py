@@ -147,14 +147,9 @@ class Constrained(Expansion):
         self.weights  # noqa: B018
         return self
 
-    def posterior_covariance_one(self, row: Array, prior: Array | None = None) -> Array:
-        return self.solution.posterior_covariance_one(self._known(row), prior)
-
-    def posterior_covariance(self, rows: Array) -> Array:
-        return self.solution.posterior_covariance(self._known(rows))
-
-    def _known(self, rows: Array) -> Array:
-        return np.asarray(rows[..., : len(self.database) * self.hyperparameters.kernel.channels])
+    def posterior_covariance(self, rows: Array, prior: Array) -> Array:
+        known = rows[:, : len(self.database) * self.hyperparameters.kernel.channels]
+        return self.solution.posterior_covariance(known, prior)
 
 
 def _multipliers(stiffness: Array, slack: Callable[[Array], Array]) -> Array:

@@ -17,7 +17,7 @@ from typing import ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import blas, lapack
+from scipy.linalg import lapack
 
 from kmp.arrays.checks import Array
 from kmp.arrays.immutable import frozen
@@ -155,30 +155,19 @@ class Dense(Expansion):
         self._covariance_solver  # noqa: B018
         return self
 
-    def posterior_covariance_one(self, row: Array, prior: Array | None = None) -> Array:
-        root = self.inverse_factor.times_one(row.T)
-        prior_covariance = (
-            self._prior_covariance if prior is None else kron_identity(prior, self.distinct)
-        )
-        return self._for_all_outputs(
-            np.asarray(prior_covariance - blas.dgemm(1.0, root, root, trans_b=1))
-        )
-
-    def posterior_covariance(self, rows: Array) -> Array:
-        if self._precision is not None:
-            d = self.distinct
-            covariance = np.tile(self._prior_covariance, (len(rows), 1, 1))
-            for i in range(d):
+    def posterior_covariance(self, rows: Array, prior: Array) -> Array:
+        prior_covariance = kron_identity(prior, self.distinct)
+        if len(prior) == 1 and self._precision is not None:
+            covariance = np.tile(prior_covariance, (len(rows), 1, 1))
+            for i in range(self.distinct):
                 for j in range(i + 1):
                     explained = np.vecdot(rows @ self._precision[i, j], rows)
                     covariance[:, i, j] -= explained
                     if i != j:
                         covariance[:, j, i] -= explained
             return self._for_all_outputs(covariance)
-        roots = self.inverse_factor.times_many(rows.T, self.hyperparameters.kernel.channels)
-        return self._for_all_outputs(
-            np.asarray(self._prior_covariance - roots.transpose(0, 2, 1) @ roots)
-        )
+        roots = self.inverse_factor.times(rows.T, len(prior))
+        return self._for_all_outputs(np.asarray(prior_covariance - roots.mT @ roots))
 
     def adapted(self, changes: Changes) -> Dense:
         """The solution with these changes; it shares this one's factor if that is faster."""
@@ -195,15 +184,6 @@ class Dense(Expansion):
         if first >= _LEAST_SHARED * count:
             return Dense(self.hyperparameters, database, self, first)
         return Dense(self.hyperparameters, database)
-
-    def extended(self, database: Database) -> Dense:
-        """The solution of a database that begins with this one: the factors get a border."""
-        bordered = Dense(self.hyperparameters, database, self, len(self.database))
-        factors = {
-            "_mean_solver": bordered.mean_factor,
-            "_covariance_solver": bordered.covariance_factor,
-        }
-        return Dense(self.hyperparameters, database)._with_cached(**factors).solved()  # noqa: SLF001 (of its own kind)
 
     def with_hyperparameters(self, hyperparameters: Hyperparameters) -> Dense:
         return Dense(hyperparameters, self.database)
@@ -226,10 +206,6 @@ class Dense(Expansion):
         """Covariances (..., O, O), of (..., C distinct, C distinct) in the factors."""
         alike = self.hyperparameters.channel_outputs // self.distinct
         return kron_identity(covariance, alike) if alike > 1 else covariance
-
-    @cached_property
-    def _prior_covariance(self) -> Array:
-        return frozen(kron_identity(self.hyperparameters.kernel.prior_variance, self.distinct))
 
     @cached_property
     def inverse_factor(self) -> InverseCholeskyFactor:

@@ -13,9 +13,9 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import lapack
 
 from kmp.arrays.checks import Array
+from kmp.arrays.inverse_cholesky import InverseCholeskyFactor
 from kmp.arrays.linear_algebra import kron_identity
 from kmp.dense import Dense
 from kmp.functionals import Functionals
@@ -87,17 +87,16 @@ class _Posterior:
             self._across -= z.T @ features
             scale = np.sqrt(solution.hyperparameters.lambda_mean)
             rows = [scale * features, scale * z]
-            copies = self._d
+            self._copies = self._d
             self._sign = 1.0
         else:
             rows = [between(kernel, solution.functionals, f) for f in (points, queries)]
-            copies = solution.distinct
+            self._copies = solution.distinct
             self._sign = -1.0
+        inverse = InverseCholeskyFactor.of(solution.mean_factor, self._copies)
         self._own, self._of_queries = (
-            lapack.dtrtrs(solution.mean_factor, kron_identity(row, copies), lower=1)[0]
-            for row in rows
+            np.ascontiguousarray(inverse.times(row, self._c).mT) for row in rows
         )
-        self._copies = copies
 
     def within(self, rows: NDArray[np.intp], roots: Array) -> Array:
         """P (G, U, O, U, O) of the points of each goal (G, U), with their `roots`."""
@@ -118,7 +117,8 @@ class _Posterior:
         near = self._across[:, _columns(rows, self._c)].transpose(1, 0, 2)  # (G, M C, U C)
         near = near @ pulls.reshape(goals, near.shape[2], -1)
         inner = roots.mT @ pulls.reshape(goals, roots.shape[1], -1)  # (G, p, D')
-        explained = self._of_queries.T @ inner.transpose(1, 0, 2).reshape(inner.shape[1], -1)
+        of_queries = self._of_queries.reshape(-1, inner.shape[1])  # (M C D', p)
+        explained = of_queries @ inner.transpose(1, 0, 2).reshape(inner.shape[1], -1)
         far = explained.reshape(len(explained), goals, -1).transpose(1, 0, 2)
         return np.asarray(near.reshape(goals, -1) + self._sign * far.reshape(goals, -1)).reshape(
             goals, -1, pulls.shape[2]
@@ -126,7 +126,8 @@ class _Posterior:
 
     def roots(self, rows: NDArray[np.intp]) -> Array:
         """The transposed roots (G, U C D', p) of the points of each goal."""
-        return np.asarray(self._own.T[_columns(rows, self._c * self._copies)])
+        own = self._own[rows]  # (G, U, C D', p)
+        return np.asarray(own.reshape(len(rows), -1, own.shape[3]))
 
 
 def _columns(rows: NDArray[np.intp], width: int) -> NDArray[np.intp]:

@@ -27,7 +27,6 @@ from kmp.low_rank import LowRank
 from kmp.mixture import GaussianMixture
 from kmp.orientation import OrientationKMP, PoseKMP
 from kmp.outputs import (
-    Decoupled,
     Mapped,
     as_one,
     constrained,
@@ -61,7 +60,7 @@ _NAMES = (
     "prior_mean",
 )
 _KERNEL = "kernel."  # begin of the names of a kernel's arrays, if `_BY_ELL` lacks it
-_OF_CONSTRAINTS = ("constraint_inputs", "constraint_normals", "constraint_bounds")
+_CONSTRAINTS = "constraints"  # begin of the names of the constraints' arrays
 _OF_LOW_RANK = ("pivots", "information", "features")
 KIND = "kind"
 _Some = TypeVar("_Some", bound=Solution)
@@ -155,13 +154,7 @@ def _of_primitive(primitive: KMP) -> dict[str, NDArray[Any]]:
             arrays[f"{name}_directions"] = functionals.directions
     if parameters.prior_covariance is not None:
         arrays["prior_covariance"] = parameters.prior_covariance
-    if (constraints := constraints_of(solution)) is not None:
-        arrays |= {
-            name: getattr(constraints, name.removeprefix("constraint_")) for name in _OF_CONSTRAINTS
-        }
-        if constraints.directions is not None:
-            arrays["constraint_directions"] = constraints.directions
-    return arrays | base.to_arrays()
+    return arrays | _of_field(constraints_of(solution), _CONSTRAINTS) | base.to_arrays()
 
 
 def _primitive(arrays: Mapping[str, NDArray[Any]], kinds: Mapping[str, Any]) -> KMP:
@@ -174,36 +167,25 @@ def _primitive(arrays: Mapping[str, NDArray[Any]], kinds: Mapping[str, Any]) -> 
         )
     base = _base(arrays, kinds)
     changes = _changes(arrays, base.database)
-    has_constraints = any(name in arrays for name in _OF_CONSTRAINTS)
-    if has_constraints and base.representation == "dense":
+    constraints = _field(arrays, _CONSTRAINTS, kinds)
+    if constraints is not None:
+        if base.representation == "low_rank":
+            raise ValueError(
+                "constraints: given for a low rank solution, a dense one needed. Leave out the "
+                "arrays of either."
+            )
         base = _weighted(as_one(base), "base_weights", arrays)
     solution: Solution = base
     if len(changes.inputs):
         solution = base.adapted(changes)
-    if has_constraints:
-        solution = _constrained(solution, arrays)
+    if constraints is not None:
+        solution = constrained(solution, constraints)
     unadapted = KMP(Inner.of_base(base))
     if solution is base:
         return unadapted
     return KMP(
         Inner(_weighted(solution, "weights", arrays), changes, unadapted.inner.count), unadapted
     )
-
-
-def _constrained(solution: Solution, arrays: Mapping[str, NDArray[Any]]) -> Solution:
-    if missing := [name for name in _OF_CONSTRAINTS if name not in arrays]:
-        raise ValueError(
-            f"The primitive's arrays lack {', '.join(missing)}: give all of "
-            f"{', '.join(_OF_CONSTRAINTS)}, or none."
-        )
-    if solution.representation == "low_rank":
-        raise ValueError(
-            "constraints: given for a low rank solution, a dense one needed. Leave out the arrays "
-            "of either."
-        )
-    inputs, normals, bounds = (arrays[name] for name in _OF_CONSTRAINTS)
-    constraints = LinearConstraints(inputs, normals, bounds, arrays.get("constraint_directions"))
-    return constrained(solution, constraints)
 
 
 def _base(arrays: Mapping[str, NDArray[Any]], kinds: Mapping[str, Any]) -> BaseSolution:
@@ -227,7 +209,7 @@ def _base(arrays: Mapping[str, NDArray[Any]], kinds: Mapping[str, Any]) -> BaseS
         return _weighted(_plain(parameters, database, arrays), "base_weights", arrays)
     t = numbers("output_map", arrays["output_map"], reference.outputs, reference.outputs)
     inner = _plain(*inner_problem(parameters, database, t), arrays)
-    return _weighted(Mapped(parameters, database, t, inner), "base_weights", arrays)
+    return _weighted(Mapped.around(parameters, database, t, inner), "base_weights", arrays)
 
 
 def _plain(
@@ -247,7 +229,7 @@ def _plain(
         part_arrays = {"information": information[group[0]], "features": features[:, group[:1]]}
         return LowRank.of_arrays(of, points, {**arrays, **part_arrays})
 
-    return Decoupled.of_parts(parameters, database, groups, part)
+    return Mapped.of_groups(parameters, database, groups, part)
 
 
 def _changes(arrays: Mapping[str, NDArray[Any]], database: Database) -> Changes:

@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,17 +80,24 @@ def _basis(root: NDArray[Any], covariance: Array) -> Array | None:
     return np.asarray(np.linalg.eigh(inner)[1], dtype=np.float64)
 
 
-def inner_problem(
-    parameters: Hyperparameters, database: Database, t: Array
-) -> tuple[Hyperparameters, Database]:
-    """The problem in the coordinates x = T^-1 y."""
+def _inner_parameters(parameters: Hyperparameters, t: Array) -> Hyperparameters:
+    """The parameters in the coordinates x = T^-1 y."""
     inverse = np.linalg.inv(t)
-    inner = replace(
+    return replace(
         parameters,
         prior_offset=frozen(inverse @ parameters.prior_offset),
         prior_matrix=frozen(inverse @ parameters.prior_matrix),
         prior_covariance=None,
     )
+
+
+def inner_problem(
+    parameters: Hyperparameters, database: Database, t: Array | None
+) -> tuple[Hyperparameters, Database]:
+    """The problem in the coordinates x = T^-1 y; T None is the identity."""
+    if t is None:
+        return parameters, database
+    inner = _inner_parameters(parameters, t)
     points = database.functionals
     return inner, Database(points, inside(inner, points, t, database.reference))
 
@@ -169,70 +176,44 @@ def _of_fixed(
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Mapped(Expansion):
-    """The solution y = T x of a solution for x. The members are those of `Solution`."""
-
-    hyperparameters: Hyperparameters
-    database: Database
-    t: Array
-    inner: Any  # a solution
-    constraints: LinearConstraints | None = None
-
-    @property
-    def representation(self) -> Literal["dense", "low_rank"]:
-        kind: Literal["dense", "low_rank"] = self.inner.representation
-        return kind
-
-    @property
-    def functionals(self) -> Functionals:
-        functionals: Functionals = self.inner.functionals
-        return functionals
-
-    @cached_property
-    def weights(self) -> Array:
-        return frozen(self.inner.weights @ self.t.T)
-
-    def solved(self) -> Mapped:
-        with variances_over_prior(self.hyperparameters):
-            self.inner.solved()
-        self.weights  # noqa: B018
-        return self
-
-    def posterior_covariance_one(self, row: Array, prior: Array | None = None) -> Array:
-        inner = self.inner.posterior_covariance_one(row, prior)
-        outputs = len(self.t)
-        blocks = inner.reshape(-1, outputs, len(inner) // outputs, outputs)
-        mapped = np.einsum("io,aobp,jp->aibj", self.t, blocks, self.t, optimize=True)
-        return np.asarray(mapped.reshape(inner.shape))
-
-    def posterior_covariance(self, rows: Array) -> Array:
-        return np.asarray(self.t @ self.inner.posterior_covariance(rows) @ self.t.T)
-
-    def adapted(self, changes: Changes) -> Mapped:
-        points = inside(self.inner.hyperparameters, changes.functionals, self.t, changes.points)
-        inner = self.inner.adapted(changes._replace(points=points))
-        return replace(self, database=self.database.changed(changes), inner=inner)
-
-    def with_hyperparameters(self, hyperparameters: Hyperparameters) -> Mapped:
-        inner, _ = inner_problem(hyperparameters, self.database, self.t)
-        return replace(
-            self, hyperparameters=hyperparameters, inner=self.inner.with_hyperparameters(inner)
-        )
-
-    def to_arrays(self) -> dict[str, NDArray[np.float64]]:
-        arrays: dict[str, NDArray[np.float64]] = self.inner.to_arrays()
-        return arrays | {"output_map": self.t}
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Decoupled(Expansion):
-    """Solutions of groups of outputs, which do not depend on each other. The members are those of
-    `Solution`.
+    """The solution y = T x, of a solution for each group of the coordinates x, which do not depend
+    on those of other groups. The members are those of `Solution`.
     """
 
     hyperparameters: Hyperparameters
     database: Database
     parts: tuple[Any, ...]  # a solution of each group
-    groups: tuple[NDArray[np.intp], ...]  # the outputs of each group
+    groups: tuple[NDArray[np.intp], ...]  # the coordinates of each group
+    t: Array | None = None  # None is the identity
+    constraints: LinearConstraints | None = None
+
+    @classmethod
+    def of_groups(
+        cls,
+        parameters: Hyperparameters,
+        database: Database,
+        groups: tuple[NDArray[np.intp], ...],
+        solution: Any,
+    ) -> Mapped:
+        """The solution by `solution(parameters, database, group)` of each group of outputs."""
+        parts = tuple(
+            solution(
+                _parameters_of(parameters, group),
+                Database(database.functionals, _of_group(database.reference, group)),
+                group,
+            )
+            for group in groups
+        )
+        return cls(parameters, database, parts, groups)
+
+    @classmethod
+    def around(
+        cls, parameters: Hyperparameters, database: Database, t: Array | None, inner: Any
+    ) -> Mapped:
+        """The solution of an inner one, of the coordinates x."""
+        if isinstance(inner, Mapped):
+            return replace(inner, hyperparameters=parameters, database=database, t=t)
+        return cls(parameters, database, (inner,), (frozen(np.arange(parameters.outputs)),), t)
 
     @property
     def representation(self) -> Literal["dense", "low_rank"]:
@@ -247,49 +228,73 @@ class Decoupled(Expansion):
     @cached_property
     def weights(self) -> Array:
         weights = np.empty((len(self.functionals), self.hyperparameters.outputs))
-        for part, group in zip(self.parts, self.groups, strict=True):
+        for part, group in self._pairs:
             weights[:, group] = part.weights
-        return frozen(weights)
+        return frozen(weights if self.t is None else weights @ self.t.T)
 
-    def solved(self) -> Decoupled:
-        for part in self.parts:
-            part.solved()
+    def solved(self) -> Mapped:
+        with variances_over_prior(self.hyperparameters):
+            for part in self.parts:
+                part.solved()
         self.weights  # noqa: B018
         return self
 
-    def posterior_covariance_one(self, row: Array, prior: Array | None = None) -> Array:
+    def posterior_covariance(self, rows: Array, prior: Array) -> Array:
         outputs = self.hyperparameters.outputs
-        queries = 1 if prior is None else len(prior) // self.hyperparameters.kernel.channels
-        out = np.zeros((queries * outputs, queries * outputs))
-        for part, group in zip(self.parts, self.groups, strict=True):
+        queries = len(prior) // self.hyperparameters.kernel.channels
+        out = np.zeros((len(rows) // len(prior), queries * outputs, queries * outputs))
+        for part, group in self._pairs:
             mine = (np.arange(queries)[:, None] * outputs + group).ravel()
-            out[np.ix_(mine, mine)] = part.posterior_covariance_one(row, prior)
-        return out
+            out[:, mine[:, None], mine] = part.posterior_covariance(rows, prior)
+        if self.t is None:
+            return out
+        blocks = out.reshape(-1, queries, outputs, queries, outputs).swapaxes(2, 3)
+        return np.asarray((self.t @ blocks @ self.t.T).swapaxes(2, 3).reshape(out.shape))
 
-    def posterior_covariance(self, rows: Array) -> Array:
-        outputs = self.hyperparameters.outputs
-        queries = len(rows) // self.hyperparameters.kernel.channels
-        out = np.zeros((queries, outputs, outputs))
-        for part, group in zip(self.parts, self.groups, strict=True):
-            out[:, group[:, None], group] = part.posterior_covariance(rows)
-        return out
-
-    def adapted(self, changes: Changes) -> Solution:
-        if not self._is_decoupled(changes.points):
-            return self._together.adapted(changes)
+    def adapted(self, changes: Changes) -> Mapped:
+        points = changes.points
+        if self.t is not None:
+            points = inside(self._inner_parameters, changes.functionals, self.t, points)
+        whole = self if self._is_decoupled(points) else self._together
         parts = tuple(
-            part.adapted(changes._replace(points=_of_group(changes.points, group)))
-            for part, group in zip(self.parts, self.groups, strict=True)
+            part.adapted(changes._replace(points=_of_group(points, group)))
+            for part, group in whole._pairs  # noqa: SLF001 (of its own kind)
         )
-        return replace(self, database=self.database.changed(changes), parts=parts)
+        return replace(whole, database=self.database.changed(changes), parts=parts)
+
+    def with_hyperparameters(self, hyperparameters: Hyperparameters) -> Mapped:
+        changed = replace(self, hyperparameters=hyperparameters)
+        parts = tuple(
+            part.with_hyperparameters(_parameters_of(changed._inner_parameters, group))  # noqa: SLF001
+            for part, group in self._pairs
+        )
+        return replace(changed, parts=parts)
+
+    def to_arrays(self) -> dict[str, NDArray[np.float64]]:
+        stored: list[dict[str, NDArray[np.float64]]] = [part.to_arrays() for part in self.parts]
+        arrays = stored[0]
+        if arrays and len(stored) > 1:
+            arrays["information"] = np.stack([part["information"] for part in stored])
+            arrays["features"] = np.hstack([part["features"] for part in stored])
+        return arrays if self.t is None else arrays | {"output_map": self.t}
+
+    @property
+    def _pairs(self) -> Iterator[tuple[Any, NDArray[np.intp]]]:
+        return zip(self.parts, self.groups, strict=True)
+
+    @property
+    def _inner_parameters(self) -> Hyperparameters:
+        t = self.t
+        return self.hyperparameters if t is None else _inner_parameters(self.hyperparameters, t)
 
     @cached_property
-    def _together(self) -> Dense | LowRank:
-        """The solution as one system."""
+    def _together(self) -> Mapped:
+        """The solution with all coordinates as one system."""
+        problem = inner_problem(self.hyperparameters, self.database, self.t)
         first = self.parts[0]
-        if isinstance(first, LowRank):
-            return LowRank.fit(self.hyperparameters, self.database, first.features)
-        return Dense(self.hyperparameters, self.database)
+        is_low_rank = isinstance(first, LowRank)
+        one = LowRank.fit(*problem, first.features) if is_low_rank else Dense(*problem)
+        return Mapped.around(self.hyperparameters, self.database, self.t, one)
 
     def _is_decoupled(self, normals: Gaussians) -> bool:
         """True if no covariance couples two groups."""
@@ -297,40 +302,6 @@ class Decoupled(Expansion):
         for n, group in enumerate(self.groups):
             number[group] = n
         return not normals.covariance[:, number[:, None] != number].any()
-
-    def with_hyperparameters(self, hyperparameters: Hyperparameters) -> Decoupled:
-        parts = tuple(
-            part.with_hyperparameters(_parameters_of(hyperparameters, group))
-            for part, group in zip(self.parts, self.groups, strict=True)
-        )
-        return replace(self, hyperparameters=hyperparameters, parts=parts)
-
-    def to_arrays(self) -> dict[str, NDArray[np.float64]]:
-        stored: list[dict[str, NDArray[np.float64]]] = [part.to_arrays() for part in self.parts]
-        if not stored[0]:
-            return {}
-        information = np.stack([arrays["information"] for arrays in stored])
-        features = np.hstack([arrays["features"] for arrays in stored])
-        return stored[0] | {"information": information, "features": features}
-
-    @classmethod
-    def of_parts(
-        cls,
-        parameters: Hyperparameters,
-        database: Database,
-        groups: tuple[NDArray[np.intp], ...],
-        solution: Any,
-    ) -> Decoupled:
-        """The solution by `solution(parameters, database, group)` of each group of outputs."""
-        parts = tuple(
-            solution(
-                _parameters_of(parameters, group),
-                Database(database.functionals, _of_group(database.reference, group)),
-                group,
-            )
-            for group in groups
-        )
-        return cls(parameters, database, parts, groups)
 
 
 def decoupled_groups(
@@ -342,7 +313,7 @@ def decoupled_groups(
     """
     values = parameters.channel_outputs
     channels = parameters.kernel.channels
-    everything = (np.arange(parameters.outputs),)
+    everything = (frozen(np.arange(parameters.outputs)),)
     if values == 1 or reference.mean.size <= SINGLE:
         return everything
     blocks = reference.covariance.reshape(-1, channels, values, channels, values)
@@ -362,7 +333,7 @@ def decoupled_groups(
     if len(groups) == 1:
         return everything
     every = values * np.arange(channels)[:, None]
-    return tuple((every + np.array(group)).ravel() for group in groups)
+    return tuple(frozen((every + np.array(group)).ravel()) for group in groups)
 
 
 def _of_group(normals: Gaussians, group: NDArray[np.intp]) -> Gaussians:
@@ -384,27 +355,28 @@ def constraints_of(solution: Solution) -> LinearConstraints | None:
 
 def as_one(base: Solution) -> BaseSolution:
     """The dense solution of a base as one system, to which constraints can be added."""
-    if isinstance(base, Mapped):
-        return replace(base, inner=as_one(base.inner))
-    return base if isinstance(base, Dense) else Dense(base.hyperparameters, base.database)
+    if is_one(base):
+        return cast(BaseSolution, base)
+    t = base.t if isinstance(base, Mapped) else None
+    one = Dense(*inner_problem(base.hyperparameters, base.database, t))
+    return one if t is None else Mapped.around(base.hyperparameters, base.database, t, one)
 
 
 def constrained(solution: Solution, constraints: LinearConstraints) -> Solution:
     """A solution as one system, with these constraints."""
     if isinstance(solution, Mapped):
-        inner_constraints = LinearConstraints(
-            constraints.inputs,
-            constraints.normals @ solution.t,
-            constraints.bounds,
-            constraints.directions,
+        t = solution.t
+        normals = constraints.normals if t is None else constraints.normals @ t
+        inner = LinearConstraints(
+            constraints.inputs, normals, constraints.bounds, constraints.directions
         )
-        inner = constrained(solution.inner, inner_constraints)
-        return replace(solution, inner=inner, constraints=constraints)
+        parts = (constrained(solution.parts[0], inner),)
+        return replace(solution, parts=parts, constraints=constraints)
     assert isinstance(solution, Dense), "as one"
     return Constrained(solution, constraints)
 
 
 def is_one(solution: Solution) -> bool:
     """True if constraints can be added to the solution."""
-    inner = solution.inner if isinstance(solution, Mapped) else solution
-    return isinstance(inner, Dense)
+    parts = solution.parts if isinstance(solution, Mapped) else (solution,)
+    return len(parts) == 1 and isinstance(parts[0], Dense)

@@ -24,7 +24,7 @@ from kmp.low_rank import Features
 from kmp.problem.database import Changes, Database
 from kmp.problem.hyperparameters import AffineMean
 from kmp.query import MotionPrediction, Query
-from kmp.solution import BLOCK, Solution, least_of_channels, mean_at
+from kmp.solution import BLOCK, Solution, mean_at
 
 _RESIDUAL = 1e-10  # residual of the features, as a share of k(s, s), in the uncertainty by distance
 
@@ -89,11 +89,7 @@ class Predictor(Immutable):
         s = self._columns(real("queries", queries))
         if (mean_and_row := self._compiled_mean(s)) is not None:
             return mean_and_row[0]
-        s = self._checked_many(s)
-        if len(s) == 1:
-            query = self.inner.query
-            return query.mean(s[0], query.row(s[0]))[None]
-        return mean_at(self.inner.solution, s)
+        return mean_at(self.inner.solution, self._checked_many(s))
 
     def predict(self, queries: ArrayLike) -> Gaussians:
         """xi(s) with its covariance at queries (M, I): M normals.
@@ -108,13 +104,10 @@ class Predictor(Immutable):
         if compiled is not None and (mean_and_row := self._compiled_mean(s)) is not None:
             return unchecked(mean_and_row[0], compiled.covariance(mean_and_row[1])[None])
         s = self._checked_many(s)
-        if len(s) == 1:
-            query = self.inner.query
-            row = query.row(s[0])
-            return unchecked(query.mean(s[0], row)[None], query.covariance(row)[None])
-        batches = [s[i : i + BLOCK] for i in range(0, len(s), BLOCK)]
+        prior = self.kernel.prior_variance
         posterior = [
-            self.inner.solution.posterior_covariance(self._rows(batch)) for batch in batches
+            self.inner.solution.posterior_covariance(self._rows(s[i : i + BLOCK]), prior)
+            for i in range(0, len(s), BLOCK)
         ]
         stacked = (
             np.concatenate(posterior) if posterior else np.empty((0, self.outputs, self.outputs))
@@ -130,8 +123,8 @@ class Predictor(Immutable):
         s = self._checked_many(queries)
         if len(s) == 0:
             raise ValueError("queries: none given, at least 1 needed.")
-        posterior = self.inner.solution.posterior_covariance_one(self._rows(s), self.kernel(s, s))
-        return unchecked(self.mean(s).reshape(1, -1), self._scaled(posterior[None]))
+        posterior = self.inner.solution.posterior_covariance(self._rows(s), self.kernel(s, s))
+        return unchecked(self.mean(s).reshape(1, -1), self._scaled(posterior))
 
     def sample(self, queries: ArrayLike, count: int, *, seed: Seed = 0) -> Array:
         """Trajectories through queries (M, I), drawn from `predict_joint`: (count, M, O).
@@ -156,7 +149,7 @@ class Predictor(Immutable):
 
         The input's velocity v (I,) [unit of the inputs / s] and acceleration a (I,) [unit of the
         inputs / s^2] give those of the output: J v, and J a + d^2 xi(s + t v)/dt^2. The numbers are
-        those of `jacobian` and `curvature`, and to rounding those of `predict`. The covariance
+        those of `jacobian`, and to rounding those of `predict`. The covariance
         takes longer than all else, and can be left out.
 
         Raises ValueError if a shape differs or a number is not finite.
@@ -190,16 +183,6 @@ class Predictor(Immutable):
         batches = [self.inner.query.jacobians(s[a : a + BLOCK]) for a in range(0, len(s), BLOCK)]
         return np.concatenate(batches) if batches else np.empty((0, self.outputs, self._dimensions))
 
-    def curvature(self, query: ArrayLike, direction: ArrayLike) -> Array:
-        """d^2 xi(s + t v)/dt^2 at t = 0, for one query s (I,) and a direction v (I,): (O,).
-
-        The second derivative of equation (8). If v is the velocity of the input [unit of the
-        inputs / s], this is the output's acceleration [unit of the outputs / s^2] at constant v.
-        Raises ValueError if a shape differs or a number is not finite.
-        """
-        v = self._checked("direction", direction)
-        return self.predict_motion(query, v, 0 * v, covariance=False).curvature
-
     def uncertainty(self, queries: ArrayLike) -> Uncertainty:
         """The covariance at queries (M, I), by its causes: differing demonstrations, distance.
 
@@ -231,17 +214,6 @@ class Predictor(Immutable):
     def lambda_covariance(self) -> float:
         """lambda of the covariance [1 / (unit of the outputs)^2]."""
         return self.inner.solution.hyperparameters.lambda_covariance
-
-    @property
-    def least_variance(self) -> float:
-        """Least variance of a via-point's values that rounding does not hide [unit of outputs^2].
-
-        With a `VelocityKernel`, that of a rate is 2 ell times larger. `adapt` raises ValueError for
-        smaller variances.
-        """
-        solution: Solution = self.inner.solution
-        variances = solution.hyperparameters.prior_variances
-        return float(least_of_channels(solution)[0] * variances.max())
 
     @property
     def prior_mean(self) -> Array | AffineMean:

@@ -20,7 +20,6 @@ from kmp.arrays.checks import (
     Array,
     brief,
     check_kind,
-    check_some,
     not_negative,
     numbers,
     one_of,
@@ -68,8 +67,7 @@ class KMP(Predictor, Plotted, Saved):
     """A skill: a reference database, the via-points in it, and its solution.
 
     `fit`, `adapt` and `load` return one. N points in all, I inputs, O outputs. Immutable, so that
-    threads may share it. The fitted numbers depend on database and parameters only, bit for bit;
-    after `extended`, to rounding.
+    threads may share it. The fitted numbers depend on database and parameters only, bit for bit.
     """
 
     inner: Inner
@@ -271,30 +269,6 @@ class KMP(Predictor, Plotted, Saved):
         fitted = self._solved_anew(self._database(points, reference))
         return _combined(fitted, self.inner.changes, self._constraints)
 
-    def extended(
-        self, inputs: ArrayLike, reference: Gaussians, *, directions: ArrayLike | None = None
-    ) -> KMP:
-        """A new primitive with M more reference points: inputs (M, I), M normals, as in `fit`.
-
-        It equals a `fit` of all points, to rounding. The dense factors grow at the cost N^2 M,
-        against (N + M)^3 for a new fit; a low rank is fitted again. Parameters, via-points, the
-        points that these replaced, and constraints remain. N of the covariance counts the new
-        points.
-
-        Raises ValueError if there is no point, and as `fit` does.
-        """
-        added = numbers("inputs", inputs, "M", self._dimensions)
-        check_some("inputs", added)
-        check_pairs("reference", added, reference, self.outputs)
-        before = self._base_solution
-        points = Functionals.checked(added, directions)
-        database = before.database.joined(self._database(points, reference))
-        if isinstance(before, Dense):
-            grown = KMP(Inner.of_base(before.extended(database)))
-        else:
-            grown = self._solved_anew(database)
-        return _combined(grown, self.inner.changes, self._constraints)
-
     def _database(self, points: Functionals, normals: Gaussians) -> Database:
         return Database(points, resolved(self.inner.solution.hyperparameters, points, normals))
 
@@ -328,7 +302,7 @@ class KMP(Predictor, Plotted, Saved):
         nearest = self.base.inner.solution.database.nearest(points, tolerance, self.kernel.period)
         remaining = ~before.near(points, tolerance, self.kernel.period)
         return Changes(
-            frozen(np.union1d(before.replaced, nearest)) if len(nearest) else before.replaced,
+            frozen(np.unique(np.concatenate([before.replaced, *nearest]))),
             Functionals.concatenated([before.functionals.take(remaining), points]),
             Gaussians.concatenated([before.points.take(remaining), desired]),
         )
@@ -601,11 +575,9 @@ class Alternatives(Sequence[KMP]):
         check_resolved(solution.hyperparameters, added, both=is_low_rank)
         if is_low_rank:
             check_resolved(solution.hyperparameters, added, name="lambda_mean", both=True)
-        period = self._primitive.kernel.period
-        replaced = [
-            solution.database.nearest(Functionals(via), self._tolerance, period)
-            for via in self._inputs
-        ]
+        nearest = solution.database.nearest(points, self._tolerance, self._primitive.kernel.period)
+        v = len(points) // len(self)
+        replaced = [np.unique(np.concatenate(nearest[v * g :][:v])) for g in range(len(self))]
         means = moved_means(solution, added, replaced, functionals)
         means += mean_of(solution, functionals)
         for n in np.flatnonzero(np.isnan(means).any(axis=(1, 2))):

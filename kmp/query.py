@@ -65,9 +65,8 @@ class Query(Immutable):
         return self.solution.hyperparameters.kernel
 
     def row(self, query: Array) -> Array:
-        """The kernel row of a query (I,): k(s, s_r) (R,) or (C, R C)."""
-        k = between(self.kernel, Functionals(query[None]), self.solution.functionals)
-        return k[0] if len(k) == 1 else k
+        """The kernel row of a query (I,): k(s, s_r) (C, R C)."""
+        return between(self.kernel, Functionals(query[None]), self.solution.functionals)
 
     def mean(self, query: Array, row: Array) -> Array:
         """xi(s) (O,). Equation (8)."""
@@ -76,9 +75,9 @@ class Query(Immutable):
 
     def covariance(self, row: Array) -> Array:
         """N / lambda_c (k(s, s) I - k (K + lambda_c Sigma)^-1 k^T) (O, O), for a row. IJRR."""
-        posterior = self.solution.posterior_covariance_one(row)
+        posterior = self.solution.posterior_covariance(row, self.kernel.prior_variance)
         deviations = self.solution.hyperparameters.prior_deviations
-        nearest = nearest_positive_semidefinite(posterior[None], deviations)[0]
+        nearest = nearest_positive_semidefinite(posterior, deviations)[0]
         return np.asarray(nearest * self.covariance_scale)
 
     def jacobians(self, queries: Array) -> Array:

@@ -17,7 +17,6 @@ from kmp.arrays.checks import RankReached
 from kmp.dense import SINGLE, Dense
 from kmp.low_rank import FLOOR, Features, LowRank
 from kmp.outputs import (
-    Decoupled,
     Mapped,
     decoupled_groups,
     inner_problem,
@@ -56,10 +55,10 @@ def solved(
     with variances_over_prior(parameters):
         problem = inner_problem(parameters, database, t)
         inner = _solved(*problem, representation, rank, tolerance)
-    return Mapped(parameters, database, t, inner).solved()
+    return Mapped.around(parameters, database, t, inner).solved()
 
 
-def dense(parameters: Hyperparameters, database: Database) -> Dense | Decoupled:
+def dense(parameters: Hyperparameters, database: Database) -> Dense | Mapped:
     """The dense solution, of each group of outputs by itself where these decouple."""
     groups = decoupled_groups(parameters, database.reference, alike=True)
     return _of_groups(parameters, database, groups, Dense)
@@ -70,10 +69,10 @@ def _of_groups(
     database: Database,
     groups: tuple[NDArray[np.intp], ...],
     solution: Callable[[Hyperparameters, Database], _Some],
-) -> _Some | Decoupled:
+) -> _Some | Mapped:
     if len(groups) == 1:
         return solution(parameters, database)
-    return Decoupled.of_parts(parameters, database, groups, lambda p, d, _: solution(p, d))
+    return Mapped.of_groups(parameters, database, groups, lambda p, d, _: solution(p, d))
 
 
 def _solved(

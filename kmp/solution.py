@@ -77,14 +77,11 @@ class Solution(Protocol):
     def solved(self) -> Self:
         """This solution, with weights and factors computed. Raises ValueError if that fails."""
 
-    def posterior_covariance_one(self, row: Array, prior: Array | None = None) -> Array:
-        """k(s, s) - k (K + lambda_c Sigma)^-1 k^T (O, O) of one query, with k (R,) or (C, R C).
-
-        For M queries jointly (M O, M O), with k (M C, R C) and `prior` k(s, s) (M C, M C).
+    def posterior_covariance(self, rows: Array, prior: Array) -> Array:
+        """k(s, s) - k (K + lambda_c Sigma)^-1 k^T (M, O, O) of M queries, each by itself, with the
+        rows k (M C, R C) and the prior k(s, s) (C, C). Q queries that are one have Q C channels and
+        Q O outputs.
         """
-
-    def posterior_covariance(self, rows: Array) -> Array:
-        """The covariances (M, O, O) for the kernel rows (M C, R C) of M queries, each by itself."""
 
     def with_weights(self, weights: Array) -> Self:
         """This solution with stored weights (R, O), which are then not computed."""

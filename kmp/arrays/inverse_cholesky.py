@@ -45,19 +45,7 @@ class InverseCholeskyFactor(Immutable):
         )
         return cls(d, tuple(frozen(band) for band in bands))
 
-    def times_one(self, x: Array) -> Array:
-        """(L^-1 (x (x) I))^T for x (n,) or (n, C): (C D, n D)."""
-        product = np.concatenate([band @ x[: band.shape[1]] for band in self.bands])
-        if x.ndim == 1:
-            return product.reshape(-1, self.copies).T
-        channels = x.shape[1]
-        return (
-            product.reshape(-1, self.copies, channels)
-            .transpose(2, 1, 0)
-            .reshape(channels * self.copies, -1)
-        )
-
-    def times_many(self, x: Array, channels: int) -> Array:
+    def times(self, x: Array, channels: int) -> Array:
         """L^-1 (x_m (x) I) for M of them side by side, x (n, M C): (M, n D, C D)."""
         product = np.concatenate([band @ x[: band.shape[1]] for band in self.bands])
         split = product.reshape(-1, self.copies, x.shape[1] // channels, channels)

@@ -96,7 +96,7 @@ class _System:
         solution = self._solution(penalty)
         held = Functionals(self.fold.held_inputs)
         rows = between(self.kernel, held, solution.functionals)
-        posterior = solution.posterior_covariance(rows)
+        posterior = solution.posterior_covariance(rows, self.kernel.prior_variance)
         deviations = solution.hyperparameters.prior_deviations
         scale = len(self.fold.inputs) / penalty
         return nearest_positive_semidefinite(posterior, deviations) * scale

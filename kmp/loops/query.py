@@ -121,7 +121,7 @@ class CompiledQuery(Immutable):
         """As `Query.covariance`, to rounding."""
         q = self.query
         if self.columns is None or not isinstance(q.solution, Dense):
-            return q.covariance(values)
+            return q.covariance(values[None])
         distinct = q.solution.distinct
         posterior = np.empty((distinct, distinct))
         if not _posterior(

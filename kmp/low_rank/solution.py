@@ -20,7 +20,7 @@ from typing import Any, ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import blas, lapack
+from scipy.linalg import lapack
 
 from kmp.arrays.checks import Array, brief, numbers
 from kmp.arrays.immutable import frozen
@@ -148,21 +148,9 @@ class LowRank(Expansion):
         self.covariance_factor  # noqa: B018
         return self
 
-    def posterior_covariance_one(self, row: Array, prior: Array | None = None) -> Array:
-        z, root = self.whitened_one(row)
-        within = blas.dgemm(1.0, root, root, trans_b=1)
-        return (
-            self.residual_covariance(z.T @ z, prior)
-            + self.hyperparameters.lambda_covariance * within
-        )
-
-    def posterior_covariance(self, rows: Array) -> Array:
-        z, roots = self.whitened(rows)
-        within = roots.transpose(0, 2, 1) @ roots
-        return (
-            self.residual_covariance(z.transpose(0, 2, 1) @ z)
-            + self.hyperparameters.lambda_covariance * within
-        )
+    def posterior_covariance(self, rows: Array, prior: Array) -> Array:
+        z, roots = self.whitened(rows, len(prior))
+        return self.explained(z, roots, prior)
 
     def adapted(self, changes: Changes) -> LowRank | Conditioned:
         """The solution conditioned on these changes, or a new fit if they are many."""
@@ -188,22 +176,16 @@ class LowRank(Expansion):
             arrays["pivot_channels"] = self.features.channels.astype(np.float64)
         return arrays
 
-    def whitened_one(self, row: Array) -> tuple[Array, Array]:
-        """The features (r, C) of one query's kernel row, and L^-1 times these (O, r D)."""
-        c = self.features.kernel.channels
-        z = self.features.of_kernel(row[..., : len(self.centres) * c])
-        return z.reshape(len(self.centres), -1), self.inverse_factor.times_one(z)
-
-    def whitened(self, rows: Array) -> tuple[Array, Array]:
+    def whitened(self, rows: Array, channels: int) -> tuple[Array, Array]:
         """The features (M, r, C) of M queries' kernel rows, and L^-1 times these (M, r D, O)."""
-        c = self.features.kernel.channels
-        z = self.features.of_kernel(rows[:, : len(self.centres) * c])
-        return z.reshape(len(z), -1, c).transpose(1, 0, 2), self.inverse_factor.times_many(z, c)
+        z = self.features.of_kernel(rows[:, : len(self.centres) * self.features.kernel.channels])
+        features = z.reshape(len(z), -1, channels).transpose(1, 0, 2)
+        return features, self.inverse_factor.times(z, channels)
 
-    def residual_covariance(self, explained: Array, prior: Array | None = None) -> Array:
-        """k(s, s) minus what the features have explained (..., C, C), per output (..., O, O)."""
-        prior_variance = self.features.kernel.prior_variance if prior is None else prior
-        return kron_identity(prior_variance - explained, self.w.shape[1])
+    def explained(self, z: Array, roots: Array, prior: Array) -> Array:
+        """The covariances (M, O, O) of what is `whitened`, and the prior k(s, s) (C, C)."""
+        residual = kron_identity(prior - z.mT @ z, self.w.shape[1])
+        return residual + self.hyperparameters.lambda_covariance * (roots.mT @ roots)
 
     @cached_property
     def mean_factor(self) -> Array:
@@ -332,15 +314,20 @@ class Conditioned(Expansion):
         self._covariance_system  # noqa: B018
         return self
 
-    def posterior_covariance_one(self, row: Array, prior: Array | None = None) -> Array:
-        z, root = self.base.whitened_one(row)
-        return np.asarray(
-            self._posterior_covariance(np.atleast_2d(row)[None], z[None], root.T[None], prior)[0]
-        )
-
-    def posterior_covariance(self, rows: Array) -> Array:
-        z, roots = self.base.whitened(rows)
-        return self._posterior_covariance(rows.reshape(len(z), z.shape[2], -1), z, roots)
+    def posterior_covariance(self, rows: Array, prior: Array) -> Array:
+        z, roots = self.base.whitened(rows, len(prior))
+        m, _, c = z.shape
+        d = self.base.w.shape[1]
+        columns = self._added_columns
+        system = self._covariance_system
+        added = rows.reshape(m, c, -1)[:, :, rows.shape[1] - columns :]  # (M, C, V C)
+        residual = added - z.mT @ self._z[:, :columns]
+        cross = self.hyperparameters.lambda_covariance * (roots.mT @ system.cross)  # (M, O, U O)
+        split = cross.reshape(m, c, d, -1, d)
+        for i in range(d):
+            split[:, :, i, :columns, i] += residual
+        gain = system.solve(cross.reshape(m * c * d, -1).T).T.reshape(cross.shape)
+        return np.asarray(self.base.explained(z, roots, prior) - gain @ cross.mT)
 
     @property
     def _added(self) -> int:
@@ -370,31 +357,6 @@ class Conditioned(Expansion):
         points = self.changes.functionals
         z = self._z[:, : self._added_columns]
         return frozen(between(self.hyperparameters.kernel, points, points) - z.T @ z)
-
-    def _posterior_covariance(
-        self, rows: Array, z: Array, roots: Array, prior: Array | None = None
-    ) -> Array:
-        """(M, O, O), of rows (M, C, (r + V) C), features z (M, r, C) and L^-1 z (M, r D, O)."""
-        m = len(z)
-        c = z.shape[2]
-        d = self.base.w.shape[1]
-        penalty = self.hyperparameters.lambda_covariance
-        columns = self._added_columns
-        system = self._covariance_system
-        # (M, C, V C)
-        residual = (
-            rows[:, :, z.shape[1] * self.base.features.kernel.channels :]
-            - z.transpose(0, 2, 1) @ self._z[:, :columns]
-        )
-        cross = penalty * (roots.transpose(0, 2, 1) @ system.cross)  # (M, O, U O)
-        split = cross.reshape(m, c, d, -1, d)
-        for i in range(d):
-            split[:, :, i, :columns, i] += residual
-        cross = split.reshape(m * c * d, -1)
-        gain = system.solve(cross.T).T.reshape(m, c * d, -1)
-        within = penalty * (roots.transpose(0, 2, 1) @ roots)
-        before = self.base.residual_covariance(z.transpose(0, 2, 1) @ z, prior) + within
-        return np.asarray(before - gain @ cross.reshape(gain.shape).transpose(0, 2, 1))
 
     def _system(
         self, name: Literal["lambda_mean", "lambda_covariance"], base_factor: Array

@@ -129,25 +129,29 @@ class Database(Immutable):
         distances, _ = cKDTree(values).query(values, k=[2])
         return float(np.median(distances))
 
-    def nearest(self, via: Functionals, tolerance: float, period: float | None) -> NDArray[np.intp]:
-        """Indices, ascending, of the values that are nearest to a via-point within the tolerance.
+    def nearest(
+        self, via: Functionals, tolerance: float, period: float | None
+    ) -> list[NDArray[np.intp]]:
+        """The indices, ascending, of the values that each via-point (V,) replaces: those nearest to
+        it within the tolerance.
 
         `tolerance` and `period` [unit of the inputs]. Derivatives neither replace a point nor are
         replaced.
         """
+        replaced = [np.empty(0, dtype=np.intp)] * len(via)
         if tolerance == 0:
-            return np.empty(0, dtype=np.intp)
-        values = via.inputs[via.values]
-        near = np.zeros(len(self), dtype=bool)
+            return replaced
+        values = np.flatnonzero(via.values)
         step = max(1, DISTANCES // len(self))
         for i in range(0, len(values), step):
-            distance = _distances(values[i : i + step], self.inputs, period)  # (V, N)
+            some = values[i : i + step]
+            distance = _distances(via.inputs[some], self.inputs, period)  # (V, N)
             if self.functionals.directions is not None:
                 distance[:, ~self.functionals.values] = np.inf
             least = distance.min(axis=1)
             for n in np.flatnonzero(least < tolerance):
-                near |= distance[n] == least[n]
-        return np.flatnonzero(near)
+                replaced[some[n]] = np.flatnonzero(distance[n] == least[n])
+        return replaced
 
 
 def _distances(a: Array, b: Array, period: float | None) -> Array:

@@ -195,10 +195,11 @@ def test_primitive_takes_any_kernel(kernel, inputs):
         np.testing.assert_allclose(primitive.jacobians([query])[0], primitive.jacobian(query))
     bend = differences(lambda s: skill.jacobian(s) @ velocity, query) @ velocity
     motion = skill.predict_motion(query, velocity, velocity)
-    np.testing.assert_allclose(skill.curvature(query, velocity), bend, atol=1e-4)
+    np.testing.assert_allclose(motion.curvature, bend, atol=1e-4)
     np.testing.assert_allclose(motion.acceleration, motion.velocity + motion.curvature)
     assert np.abs(through.jacobian(goal) @ velocity).max() < 0.1
-    assert np.array_equal(skill.curvature(query, 0 * velocity), [0.0, 0.0])
+    still = 0 * velocity
+    assert np.array_equal(skill.predict_motion(query, still, still).curvature, [0.0, 0.0])
     assert (np.linalg.eigvalsh(skill.uncertainty([query]).distance) > 0).all()
     assert skill.sample([query, query + 0.1], 2, seed=0).shape == (2, 2, 2)
     assert (skill.via_point_reach(query) > 0).all()
@@ -206,8 +207,6 @@ def test_primitive_takes_any_kernel(kernel, inputs):
     assert skill.constrained(above).mean(S[:3, :inputs])[:, 0].min() > 0.5 - 1e-8
     low = fitted(kernel, inputs, representation="low_rank")
     np.testing.assert_allclose(low.mean(S[:, :inputs]), skill.mean(S[:, :inputs]), atol=1e-6)
-    more = skill.extended([query], Gaussians.of([0.0, 0.0], deviation=0.1))
-    assert len(more.inputs) == 41
     halves = [(S[i::2, :inputs], MU[i::2]) for i in range(2)]
     assert learn(halves, components=3, seed=0, kernel=kernel).primitive.kernel is kernel
 
@@ -222,7 +221,7 @@ def test_curvature_with_observed_derivatives(kernel):
     for at in (query, query + 0.05):
         skill = fitted(kernel, 2).adapt([at], rest, directions=[v], tolerance=0.0)
         bend = differences(lambda s, of=skill: of.jacobian(s) @ v, query) @ v
-        np.testing.assert_allclose(skill.curvature(query, v), bend, atol=1e-4)
+        np.testing.assert_allclose(skill.predict_motion(query, v, v).curvature, bend, atol=1e-4)
 
 
 @pytest.mark.parametrize(("kind", "nu"), [(Matern32, 1.5), (Matern52, 2.5)])

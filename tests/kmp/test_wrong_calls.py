@@ -125,7 +125,6 @@ RIGHT = {
     KMP.load: {"path": "skill.npz", "kernels": {}},
     ONE.adapt_jacobian: {"inputs": S[:1], "jacobians": np.eye(2)[None], "deviation": 0.1},
     ONE.constrained: {"constraints": LIMITS},
-    ONE.extended: {"inputs": S[:2] + 1, "reference": R[:2], "directions": np.zeros((2, 2))},
     ONE.refitted: {"reference": R},
     named_arrays.from_arrays: {"arrays": named_arrays.to_arrays(LOW), "kernels": {}},
     ONE.mean: {"queries": S},
@@ -137,7 +136,6 @@ RIGHT = {
     ONE.predict_motion: {"query": S[0], "velocity": S[1], "acceleration": S[2]},
     ONE.jacobian: {"query": S[0]},
     ONE.jacobians: {"queries": S},
-    ONE.curvature: {"query": S[0], "direction": S[1]},
     ONE.uncertainty: {"queries": S},
     LinearConstraints: {"inputs": S, "normals": S, "bounds": S[:, 0], "directions": S},
     LIMITS.joined: {"other": LIMITS},
@@ -277,7 +275,7 @@ OF_THE_KERNEL = {
     "curvature",
 }
 
-OF_KNOWN_COLUMNS = {"queries", "query", "velocity", "acceleration", "direction", "offset"}
+OF_KNOWN_COLUMNS = {"queries", "query", "velocity", "acceleration", "offset"}
 WRONG_COLUMNS = {0, 1}  # indices in the second list of `wrong_arrays`: one column more, none
 OF_ANY_SIZE = {GaussianKernel, Matern32, Matern52, Gaussians.of, regressor}
 OPTIONAL = {

@@ -94,14 +94,14 @@ def naive(one, queries):
 
 def same_bits(a, b, queries):
     query = queries[0]
-    direction = np.ones(queries.shape[1])
+    moving = query, np.ones(queries.shape[1]), np.zeros(queries.shape[1])
     return all(
         np.array_equal(x, y)
         for x, y in [
             (a.mean(queries), b.mean(queries)),
             (a.mean(queries[:1]), b.mean(queries[:1])),
             (a.jacobian(query), b.jacobian(query)),
-            (a.curvature(query, direction), b.curvature(query, direction)),
+            (a.predict_motion(*moving).curvature, b.predict_motion(*moving).curvature),
             (a.predict(queries[:1]).covariance, b.predict(queries[:1]).covariance),
             (a.predict(queries).covariance, b.predict(queries).covariance),
         ]
