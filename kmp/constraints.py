@@ -148,8 +148,8 @@ class Constrained(Expansion):
         return self
 
     def posterior_covariance(self, rows: Array, prior: Array) -> Array:
-        known = rows[:, : len(self.database) * self.hyperparameters.kernel.channels]
-        return self.solution.posterior_covariance(known, prior)
+        columns = len(self.database) * self.hyperparameters.kernel.channels
+        return self.solution.posterior_covariance(rows[:, :columns], prior)
 
 
 def _multipliers(stiffness: Array, slack: Callable[[Array], Array]) -> Array:

@@ -138,8 +138,8 @@ class _Posterior:
 
     def roots(self, rows: NDArray[np.intp]) -> Array:
         """The transposed roots (G, U C D', p) of the points of each goal."""
-        own = self._own[rows]  # (G, U, C D', p)
-        return np.asarray(own.reshape(len(rows), -1, own.shape[3]))
+        roots = self._own[rows]  # (G, U, C D', p)
+        return np.asarray(roots.reshape(len(rows), -1, roots.shape[3]))
 
 
 def _columns(rows: NDArray[np.intp], width: int) -> NDArray[np.intp]:

@@ -293,8 +293,8 @@ class Mapped(Expansion):
         problem = inner_problem(self.hyperparameters, self.database, self.t)
         first = self.parts[0]
         is_low_rank = isinstance(first, LowRank)
-        one = LowRank.fit(*problem, first.features) if is_low_rank else Dense(*problem)
-        return Mapped.around(self.hyperparameters, self.database, self.t, one)
+        system = LowRank.fit(*problem, first.features) if is_low_rank else Dense(*problem)
+        return Mapped.around(self.hyperparameters, self.database, self.t, system)
 
     def _is_decoupled(self, normals: Gaussians) -> bool:
         """True if no covariance couples two groups."""
@@ -358,8 +358,8 @@ def as_one(base: Solution) -> BaseSolution:
     if is_one(base):
         return cast(BaseSolution, base)
     t = base.t if isinstance(base, Mapped) else None
-    one = Dense(*inner_problem(base.hyperparameters, base.database, t))
-    return one if t is None else Mapped.around(base.hyperparameters, base.database, t, one)
+    system = Dense(*inner_problem(base.hyperparameters, base.database, t))
+    return system if t is None else Mapped.around(base.hyperparameters, base.database, t, system)
 
 
 def constrained(solution: Solution, constraints: LinearConstraints) -> Solution:
