@@ -180,17 +180,17 @@ def test_franka_keeps_its_limits_while_daemons_are_killed(tmp_path: Path) -> Non
 # --- bad input -----------------------------------------------------------------------------------
 
 
-def refused(*arguments: str) -> str:
+def refused(*arguments: str, exit_code: int = 1) -> str:
     """The standard error of a `thirdhand follow` that fails."""
     done = told("follow", *arguments)
-    assert (done.returncode, done.stdout) == (1, "")
+    assert (done.returncode, done.stdout) == (exit_code, "")
     (line,) = done.stderr.splitlines()
     return line
 
 
 def test_bad_input_ends_in_a_sentence_with_what_to_do(tmp_path: Path) -> None:
     assert "no arm 'frankia'; franka, simulated, ur, wam, xarm accepted, or one" in refused(
-        "frankia"
+        "frankia", exit_code=2
     )
     assert "is a daemon or a router running" in refused(
         "simulated", "--connect", "tcp/127.0.0.1:1", "--wait", "0.2"
