@@ -139,3 +139,18 @@ def test_goal_jacobian_with_constraints_is_refused():
     bound = LinearConstraints([[1.0]], [[1.0, 0.0]], [0.5])
     with pytest.raises(ValueError, match="goal_jacobian: a primitive with constraints"):
         primitive().constrained(bound).goal_jacobian(QUERIES)
+
+
+def test_goals_where_rounding_nearly_hides_the_covariance():
+    mean = np.hstack([np.sin(3 * INPUTS), np.cos(2 * INPUTS)])
+    reference = Gaussians.of(mean, deviation=1e-4)
+    of = KMP.fit(INPUTS, reference, kernel=GaussianKernel(8.0), lambda_mean=1.0)
+    alternatives = of.adapt_many(
+        [
+            ([[t]], Gaussians.of(of.mean([[t]]) + 0.1, deviation=1e-3))
+            for t in (0.12, 0.51, 0.93, 1.27, 1.75)
+        ],
+        tolerance=0.0,
+    )
+    expected = [each.mean(QUERIES) for each in alternatives]
+    np.testing.assert_allclose(alternatives.mean(QUERIES), expected, atol=1e-8)
