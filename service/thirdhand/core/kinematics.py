@@ -14,15 +14,8 @@ from thirdhand.core.vectors import add_product, cross, square, transform
 
 
 class Kinematics:
-    """The arm at some joints, as one record (1,), whose fields are attributes; `ArmStage.at`
-    computes it.
-
-    * `joints` (J,) [rad, m].
-    * `position` (3,) [m] and `rotation` (3, 3) of the tool, frame base.
-    * `tasks` (5 or 6, J) [m]: tool velocity, and turn times lever, per joint velocity. Rows 0 to 2
-      are linear, in frame base; the others turn the tool about its own x, y (and z).
-    * `damping` of the tasks [m²].
-    * `jacobian` of the tool (6, J), linear before angular rows, frame base.
+    """The arm at some joints, as one record (1,) that `ArmStage.at` computes: joints (J,) [rad, m],
+    damping of the tasks [m²], and the properties below.
     """
 
     __slots__ = ("record",)
@@ -30,8 +23,27 @@ class Kinematics:
     def __init__(self, record: Records) -> None:
         self.record = record
 
-    def __getattr__(self, field: str) -> Vector:
-        return self.record[field][0]  # type: ignore[no-any-return]
+    @property
+    def position(self) -> Vector:
+        """(3,) [m] of the tool, frame base."""
+        return np.asarray(self.record["position"][0])
+
+    @property
+    def rotation(self) -> Vector:
+        """(3, 3) of the tool, frame base."""
+        return np.asarray(self.record["rotation"][0])
+
+    @property
+    def tasks(self) -> Vector:
+        """(5 or 6, J) [m]: tool velocity, and turn times lever, per joint velocity. Rows 0 to 2 are
+        linear, in frame base; the others turn the tool about its own x, y (and z).
+        """
+        return np.asarray(self.record["tasks"][0])
+
+    @property
+    def jacobian(self) -> Vector:
+        """(6, J) of the tool, linear before angular rows, frame base."""
+        return np.asarray(self.record["jacobian"][0])
 
 
 @compiled
