@@ -16,7 +16,7 @@ from thirdhand.contract.explain import ExplainedError
 from thirdhand.contract.messages import Attachment
 from thirdhand.contract.requests import ViaPoint
 from thirdhand.core.controller import Controller, outgoing, run
-from thirdhand.core.frame import STAGES, Frame, Outputs, Tick, order, timed
+from thirdhand.core.frame import STAGES, Event, Frame, Outputs, Tick, order, timed
 from thirdhand.core.limiter.stage import Limiter
 from thirdhand.core.warm_up import warm_up
 from thirdhand.daemon import supervised_thread
@@ -70,6 +70,7 @@ class Daemon:
         """`skills` is the folder from which clients load skills."""
         self._cell = cell
         self._newest = -1  # index of the newest tick
+        self._received: list[Event] = []  # the messages for the next tick that came before it
         self._failed_at: int | None = None  # tick of the loop's last failure
 
         # A second controller rehearses likely ticks, see `_warm_up`.
@@ -204,7 +205,8 @@ class Daemon:
                     )
                     return
 
-            inbox = cell.streams.receive()
+            inbox = cell.streams.receive(self._received)
+            self._received = []
             if requests:
                 inbox += requests.take(cell.controller.state)
             while cell.own:
@@ -215,10 +217,12 @@ class Daemon:
             requests.answer(cell.frame)  # the frame of this tick
 
     def _warm_up(self) -> None:
-        """Run a copy of the controller on a likely next tick, from received to published bytes, so
-        that code and data are in the processor's caches.
+        """Read the messages that have come for the next tick. Then run a copy of the controller on
+        a likely one, from received to published bytes, so that code and data are in the processor's
+        caches.
         """
         cell = self._cell
+        self._received = cell.streams.receive(self._received)
         newest = tuple(cell.streams.newest.values())
         for event in newest:
             channels.BY_KEY[event.kind].codec.decode(event.payload)
