@@ -224,7 +224,6 @@ class CellStreams:
         cell = settings.cell
         domain = settings.network.ros2_domain
         self._arrivals = arrivals
-        self.newest: dict[str, Event] = {}
         self._frozen = {f"hands/{side}": FrozenHand() for side in SIDES}
         self._sole = {key: SolePublisher() for key in (*self._frozen, TOOL_WISH)}
         self._joints = JointStates(settings.joints.names, settings.arm.silent_ms / 1000)
@@ -343,8 +342,7 @@ class CellStreams:
         if hand is not None and hand.is_frozen(message):
             arrivals.frozen += 1
             return None
-        event = self.newest[suffix] = Event(suffix, payload, message)
-        return event
+        return Event(suffix, payload, message)
 
     def publish(self, suffix: str, payload: bytes, attachment: bytes | None = None) -> None:
         """Publish on a channel; a message that cannot be sent at once is dropped."""
