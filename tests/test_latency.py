@@ -121,12 +121,15 @@ def test_the_loop_keeps_its_time(kept: Path) -> None:
 
 
 def test_report_and_picture_and_recording_are_kept(kept: Path) -> None:
-    whole = json.loads((kept / "bench.json").read_text())["whole"]
+    report = json.loads((kept / "bench.json").read_text())
+    whole = report["whole"]
     ticks = SECONDS / 3 * RATE_HZ
     assert whole["ticks"] == pytest.approx(ticks, abs=0.1 * ticks)
     assert sum(whole["work_counts"]) == pytest.approx(ticks, abs=0.1 * ticks)
     segments = sum(stage["p50"] for stage in whole["stages_us"].values())
-    assert 0.2 < segments / whole["work_us"]["p50"] < 1.1
+    # most ticks are rehearsed before their deadline, and work is what is left after it
+    assert 0.2 < segments / report["core"]["work_us"]["p50"] < 1.1
+    assert whole["work_us"]["p50"] < segments
     assert {"daemon", "fork server", "scribe", "skill worker"} == set(whole["processes"])
     assert (kept / "bench.png").read_bytes().startswith(b"\x89PNG")
     assert replay(next(kept.glob("*.mcap"))).exact

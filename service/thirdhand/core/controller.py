@@ -169,11 +169,13 @@ class Controller:
         return self._separation.max_speed
 
     def copy_from(self, other: Controller) -> None:
-        """Take over state and skill of another controller with the same settings."""
+        """Take over state, skill and reports of another controller with the same settings."""
         if self.skill is not other.skill:
             self._adopt(other.skill)
         self._bytes[:] = other._bytes
         self._here = other._here
+        self.decision.measured = other.decision.measured
+        self.intake.copy_reports(other.intake)
 
     def step(self, tick: Tick, lap: Lap = no_lap) -> Frame:
         """Frame of one tick, whose index must be higher than that of the tick before.
@@ -365,15 +367,13 @@ def _digest(stage: object) -> str:
     return sums.hexdigest()
 
 
-def run(
-    controller: Controller, ticks: Iterable[Tick], taps: Iterable[Tap], lap: Lap = no_lap
-) -> None:
-    """Step a controller through all ticks and pass each frame to the taps. Live operation, replay
-    and tests all use this loop.
+def run(controller: Controller, ticks: Iterable[Tick], taps: Iterable[Tap]) -> None:
+    """Step a controller through all ticks and pass each frame to the taps, as replay and tests do.
+    Live operation rehearses ticks too, see `daemon.daemon`.
     """
     taps = tuple(taps)
     for tick in ticks:
-        frame = controller.step(tick, lap)
+        frame = controller.step(tick)
         for tap in taps:
             tap(tick, frame)
 

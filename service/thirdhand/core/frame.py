@@ -124,7 +124,8 @@ TIMING_FIELDS = (
     Field("work_us", "float32"),  # from the begin of the tick to its published command
     # from the newest hand sample's stamp to the published command; 0: no new one
     Field("latency_us", "float32"),
-    Field("stages_us", "float32", (len(STAGES),)),  # durations, in the order of STAGES
+    # durations, in the order of STAGES; of the rehearsal, if its frame is the tick's
+    Field("stages_us", "float32", (len(STAGES),)),
 )
 TIMING = dtype_of(TIMING_FIELDS, 0)
 _TIMING = struct.Struct(f"<3q3f{len(STAGES)}f")  # as TIMING

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from statistics import median
 from typing import Any, TypeAlias
 
@@ -224,7 +224,6 @@ class CellStreams:
         cell = settings.cell
         domain = settings.network.ros2_domain
         self._arrivals = arrivals
-        self.newest: dict[str, Event] = {}
         self._frozen = {f"hands/{side}": FrozenHand() for side in SIDES}
         self._sole = {key: SolePublisher() for key in (*self._frozen, TOOL_WISH)}
         self._joints = JointStates(settings.joints.names, settings.arm.silent_ms / 1000)
@@ -256,18 +255,21 @@ class CellStreams:
             None if domain is None else Ros2Domain(session, settings, topics, failed=failed)
         )
 
-    def receive(self) -> list[Event]:
-        """The messages since the last call; of the arm's states only the newest. Messages that
-        cannot be decoded are counted.
+    def receive(self, earlier: Sequence[Event] = ()) -> list[Event]:
+        """The `earlier` messages and those since the last call; of the arm's states only the
+        newest. Messages that cannot be decoded are counted.
         """
-        events: list[Event] = []
+        events = list(earlier)
         for suffix, source in self._subscribers:
             arrived: list[Event] = []
             for sample in _waiting(source, _most(suffix)):
                 publisher = identity(sample) if suffix in self._sole else ""
                 if (event := self._decoded(suffix, sample.payload, publisher, sample)) is not None:
                     arrived.append(event)
-            events += arrived[-1:] if suffix == ARM_STATE else arrived
+            if arrived and suffix == ARM_STATE:
+                arrived = arrived[-1:]
+                events = [event for event in events if event.kind != ARM_STATE]
+            events += arrived
         for by_frame, source in self._transforms:
             for suffix, payload, publisher in self._poses(by_frame, source):
                 if (event := self._decoded(suffix, payload, publisher)) is not None:
@@ -340,8 +342,7 @@ class CellStreams:
         if hand is not None and hand.is_frozen(message):
             arrivals.frozen += 1
             return None
-        event = self.newest[suffix] = Event(suffix, payload, message)
-        return event
+        return Event(suffix, payload, message)
 
     def publish(self, suffix: str, payload: bytes, attachment: bytes | None = None) -> None:
         """Publish on a channel; a message that cannot be sent at once is dropped."""

@@ -243,11 +243,12 @@ class TickTimes:
         """Note that a tick begins, this late [ns]."""
         self._late_ns = late_ns
         self._began_ns = self._lap_ns = time.perf_counter_ns()
-        self._stages_us = [0.0] * len(STAGES)
 
     def lap(self, stage: str) -> None:
-        """Note that a stage of the tick ends."""
+        """Note that a stage of the tick ends, or of its rehearsal; the first one begins anew."""
         now_ns = time.perf_counter_ns()
+        if stage == STAGES[0]:
+            self._stages_us = [0.0] * len(STAGES)
         self._stages_us[_PLACE_OF_STAGE[stage]] = (now_ns - self._lap_ns) / 1e3
         self._lap_ns = now_ns
 
