@@ -200,7 +200,7 @@ class Daemon:
         requests = cell.inbox
         stop_by: float | None = None
         # A period of 1 ms has no time to prepare the next tick.
-        has_time = cell.clock.period_ns >= 3 * PREPARE_NS
+        has_time = cell.clock.period_ns >= 2 * PREPARE_NS
         prepare = self._warm_up if has_time and cell.settings.loop.prepare else None
         while True:
             index, late_ns = cell.clock.wait(prepare)
