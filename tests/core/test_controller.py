@@ -335,15 +335,19 @@ def test_twin_decides_the_same(taught: Skill) -> None:
 
 
 def test_what_a_twin_decided_is_taken_over(taught: Skill) -> None:
-    """With every other tick decided by a twin, frames, state and reports are the same."""
+    """A twin rehearses each tick. With every other one taken over, frames, state and reports are
+    the same.
+    """
     alone, controller, twin = (Controller(ASSUMED, taught, urdf=URDF) for _ in range(3))
     for tick in resting(0, 300):
         twice = Tick(tick.index, (*tick.inbox, *tick.inbox))  # the second ones are rejected
         expected = alone.step(twice)
         twin.copy_from(controller)
-        frame = (twin if tick.index % 2 else controller).step(twice)
+        frame = twin.step(twice)
         if tick.index % 2:
             controller.copy_from(twin)
+        else:
+            frame = controller.step(twice)
         assert frame.tobytes() == expected.tobytes()
     assert controller.state.tobytes() == alone.state.tobytes()
     assert controller.intake.rejected.any()

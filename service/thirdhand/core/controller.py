@@ -175,7 +175,8 @@ class Controller:
         self._bytes[:] = other._bytes
         self._here = other._here
         self.decision.measured = other.decision.measured
-        self.intake.copy_reports(other.intake)
+        self.intake.refused = other.intake.refused.copy()
+        self.intake.rejected[:] = other.intake.rejected
 
     def step(self, tick: Tick, lap: Lap = no_lap) -> Frame:
         """Frame of one tick, whose index must be higher than that of the tick before.

@@ -153,11 +153,6 @@ class Intake:
         state["stale_ticks"] = self.parameters["stale_ticks"][0]
         self._estimator.begin(state)
 
-    def copy_reports(self, other: Intake) -> None:
-        """Take over what is for reports only."""
-        self.refused = other.refused.copy()
-        self.rejected[:] = other.rejected
-
     def step(self, state: Record, frame: Record, ticks: int, samples: list[Event]) -> int:
         """Advance the state by some ticks and take the samples in. Returns the flags of
         `codes.Condition` that `step.report` lists.
