@@ -29,7 +29,7 @@ from kmp.solution import mean_of
 _LEAST_SINGULAR = 1e-7
 # least lambda Sigma / k(s, s) from which products with the inverse factor, in half of the time of
 # a triangular solve, are exact to 1e-9
-_PRECISE = 1e-5
+_INVERTIBLE = 1e-5
 
 
 def moved_means(
@@ -99,7 +99,7 @@ class _Posterior:
             self._sign = -1.0
         factor = solution.mean_factor
         inverse = None
-        if solution.database.exceeds(kernel, _PRECISE / solution.hyperparameters.lambda_mean):
+        if solution.database.exceeds(kernel, _INVERTIBLE / solution.hyperparameters.lambda_mean):
             inverse = InverseCholeskyFactor.of(factor, self._copies)
 
         def root_of(row: Array) -> Array:

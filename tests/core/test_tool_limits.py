@@ -45,7 +45,9 @@ def test_limit_uses_all_that_is_planned(name: str) -> None:
             jacobian = pose.tasks[:3] * weights
             moved = weights * (
                 jacobian.T
-                @ np.linalg.solve(jacobian @ jacobian.T + pose.damping * np.eye(3), value * u)
+                @ np.linalg.solve(
+                    jacobian @ jacobian.T + pose.record["damping"][0] * np.eye(3), value * u
+                )
             )
             shares = np.abs(moved) / limits
             assert shares.max() == pytest.approx(PLANNED_LIMIT_SHARES[order], rel=0.01)

@@ -14,7 +14,7 @@ SETTINGS = Settings()
 JOINTS = SETTINGS.joints.names
 
 
-def test_messages_read_early_are_kept_but_for_the_older_states_of_the_arm() -> None:
+def test_early_messages_are_kept_but_for_older_states_of_the_arm() -> None:
     with open_session(listen=["tcp/127.0.0.1:0"]) as listening:
         arrivals = {channel.key: Arrivals() for channel in heard(SETTINGS)}
         streams = CellStreams(listening, SETTINGS, arrivals=arrivals, failed=print)
