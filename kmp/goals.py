@@ -27,8 +27,8 @@ from kmp.solution import mean_of
 
 # least singular value / k(s, s) of a goal's system: errors are 4e-16 over it
 _LEAST_SINGULAR = 1e-7
-# least lambda Sigma / k(s, s) from which products with the inverse factor, in half of the time of
-# a triangular solve, are exact to 1e-9
+# least lambda Sigma / k(s, s) from which products with the inverse factor are exact to 1e-9; with
+# many goals they take down to half of the time of a triangular solve
 _INVERTIBLE = 1e-5
 
 
@@ -99,7 +99,10 @@ class _Posterior:
             self._sign = -1.0
         factor = solution.mean_factor
         inverse = None
-        if solution.database.exceeds(kernel, _INVERTIBLE / solution.hyperparameters.lambda_mean):
+        right_sides = self._c * self._copies * (len(points) + len(queries))
+        if right_sides >= len(factor) and solution.database.exceeds(
+            kernel, _INVERTIBLE / solution.hyperparameters.lambda_mean
+        ):
             inverse = InverseCholeskyFactor.of(factor, self._copies)
 
         def root_of(row: Array) -> Array:

@@ -60,9 +60,10 @@ _NAMES = (
     "prior_mean",
 )
 _KERNEL = "kernel."  # begin of the names of a kernel's arrays, if `_BY_ELL` lacks it
-_CONSTRAINTS = "constraints"  # begin of the names of the constraints' arrays
-_OF_LOW_RANK = ("pivots", "information", "features")
 KIND = "kind"
+_CONSTRAINTS = "constraints"  # begin of the names of the constraints' arrays
+_OF_CONSTRAINTS = tuple(f"constraints.{name}" for name in (KIND, "inputs", "normals", "bounds"))
+_OF_LOW_RANK = ("pivots", "information", "features")
 _Some = TypeVar("_Some", bound=Solution)
 _KINDS: dict[str, Any] = {
     kind.__name__: kind
@@ -167,7 +168,7 @@ def _primitive(arrays: Mapping[str, NDArray[Any]], kinds: Mapping[str, Any]) -> 
         )
     base = _base(arrays, kinds)
     changes = _changes(arrays, base.database)
-    constraints = _field(arrays, _CONSTRAINTS, kinds)
+    constraints = _constraints(arrays, kinds)
     if constraints is not None:
         if base.representation == "low_rank":
             raise ValueError(
@@ -186,6 +187,21 @@ def _primitive(arrays: Mapping[str, NDArray[Any]], kinds: Mapping[str, Any]) -> 
     return KMP(
         Inner(_weighted(solution, "weights", arrays), changes, unadapted.inner.count), unadapted
     )
+
+
+def _constraints(
+    arrays: Mapping[str, NDArray[Any]], kinds: Mapping[str, Any]
+) -> LinearConstraints | None:
+    if not any(name.startswith(_CONSTRAINTS) for name in arrays):
+        return None
+    if missing := [name for name in _OF_CONSTRAINTS if name not in arrays]:
+        raise ValueError(
+            f"The primitive's arrays lack {', '.join(missing)}: give all of "
+            f"{', '.join(_OF_CONSTRAINTS)}, or none."
+        )
+    constraints = _value(arrays, f"{_CONSTRAINTS}.", kinds)
+    check_kind(_OF_CONSTRAINTS[0], constraints, LinearConstraints, "inputs, normals, bounds")
+    return cast(LinearConstraints, constraints)
 
 
 def _base(arrays: Mapping[str, NDArray[Any]], kinds: Mapping[str, Any]) -> BaseSolution:

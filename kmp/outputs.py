@@ -244,29 +244,30 @@ class Mapped(Expansion):
         queries = len(prior) // self.hyperparameters.kernel.channels
         out = np.zeros((len(rows) // len(prior), queries * outputs, queries * outputs))
         for part, group in self._pairs:
-            mine = (np.arange(queries)[:, None] * outputs + group).ravel()
-            out[:, mine[:, None], mine] = part.posterior_covariance(rows, prior)
+            columns = (np.arange(queries)[:, None] * outputs + group).ravel()
+            out[:, columns[:, None], columns] = part.posterior_covariance(rows, prior)
         if self.t is None:
             return out
         blocks = out.reshape(-1, queries, outputs, queries, outputs).swapaxes(2, 3)
         return np.asarray((self.t @ blocks @ self.t.T).swapaxes(2, 3).reshape(out.shape))
 
-    def adapted(self, changes: Changes) -> Mapped:
+    def adapted(self, changes: Changes) -> Solution:
         points = changes.points
         if self.t is not None:
             points = inside(self._inner_parameters, changes.functionals, self.t, points)
-        whole = self if self._is_decoupled(points) else self._together
+        if not self._is_decoupled(points):
+            return self._together.adapted(changes)
         parts = tuple(
             part.adapted(changes._replace(points=_of_group(points, group)))
-            for part, group in whole._pairs  # noqa: SLF001 (of its own kind)
+            for part, group in self._pairs
         )
-        return replace(whole, database=self.database.changed(changes), parts=parts)
+        return replace(self, database=self.database.changed(changes), parts=parts)
 
     def with_hyperparameters(self, hyperparameters: Hyperparameters) -> Mapped:
         changed = replace(self, hyperparameters=hyperparameters)
+        inner = changed._inner_parameters  # noqa: SLF001 (of its own kind)
         parts = tuple(
-            part.with_hyperparameters(_parameters_of(changed._inner_parameters, group))  # noqa: SLF001
-            for part, group in self._pairs
+            part.with_hyperparameters(_parameters_of(inner, group)) for part, group in self._pairs
         )
         return replace(changed, parts=parts)
 
@@ -288,12 +289,18 @@ class Mapped(Expansion):
         return self.hyperparameters if t is None else _inner_parameters(self.hyperparameters, t)
 
     @cached_property
-    def _together(self) -> Mapped:
+    def _together(self) -> BaseSolution:
         """The solution with all coordinates as one system."""
         problem = inner_problem(self.hyperparameters, self.database, self.t)
         first = self.parts[0]
         is_low_rank = isinstance(first, LowRank)
         system = LowRank.fit(*problem, first.features) if is_low_rank else Dense(*problem)
+        return self._around(system)
+
+    def _around(self, system: Dense | LowRank) -> BaseSolution:
+        """The solution of the same problem by one system for all coordinates."""
+        if self.t is None:
+            return system
         return Mapped.around(self.hyperparameters, self.database, self.t, system)
 
     def _is_decoupled(self, normals: Gaussians) -> bool:
@@ -357,9 +364,9 @@ def as_one(base: Solution) -> BaseSolution:
     """The dense solution of a base as one system, to which constraints can be added."""
     if is_one(base):
         return cast(BaseSolution, base)
-    t = base.t if isinstance(base, Mapped) else None
-    system = Dense(*inner_problem(base.hyperparameters, base.database, t))
-    return system if t is None else Mapped.around(base.hyperparameters, base.database, t, system)
+    if not isinstance(base, Mapped):
+        return Dense(base.hyperparameters, base.database)
+    return base._around(Dense(*inner_problem(base.hyperparameters, base.database, base.t)))  # noqa: SLF001
 
 
 def constrained(solution: Solution, constraints: LinearConstraints) -> Solution:

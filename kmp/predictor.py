@@ -149,8 +149,8 @@ class Predictor(Immutable):
 
         The input's velocity v (I,) [unit of the inputs / s] and acceleration a (I,) [unit of the
         inputs / s^2] give those of the output: J v, and J a + d^2 xi(s + t v)/dt^2. The numbers are
-        those of `jacobian`, and to rounding those of `predict`. The covariance
-        takes longer than all else, and can be left out.
+        those of `jacobian`, and to rounding those of `predict`. The covariance takes longer than
+        all else, and can be left out.
 
         Raises ValueError if a shape differs or a number is not finite.
         """

@@ -577,7 +577,10 @@ class Alternatives(Sequence[KMP]):
             check_resolved(solution.hyperparameters, added, name="lambda_mean", both=True)
         nearest = solution.database.nearest(points, self._tolerance, self._primitive.kernel.period)
         v = len(points) // len(self)
-        replaced = [np.unique(np.concatenate(nearest[v * g :][:v])) for g in range(len(self))]
+        replaced = [
+            np.unique(np.concatenate(nearest[start : start + v]))
+            for start in range(0, len(points), v)
+        ]
         means = moved_means(solution, added, replaced, functionals)
         means += mean_of(solution, functionals)
         for n in np.flatnonzero(np.isnan(means).any(axis=(1, 2))):

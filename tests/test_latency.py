@@ -46,12 +46,12 @@ def busy(seconds):
 
 receive, thread = CellStreams.receive, threading.Thread(target=busy, args=(1e3,), daemon=True)
 
-def planted(self):
+def planted(self, earlier=()):
     if not {thread}:
         busy(0.001)
     elif thread.ident is None:  # once the loop runs
         thread.start()
-    return receive(self)
+    return receive(self, earlier)
 
 CellStreams.receive = planted
 sys.exit(main(sys.argv[1:]))

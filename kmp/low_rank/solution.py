@@ -150,7 +150,7 @@ class LowRank(Expansion):
 
     def posterior_covariance(self, rows: Array, prior: Array) -> Array:
         z, roots = self.whitened(rows, len(prior))
-        return self.explained(z, roots, prior)
+        return self.covariance_of(z, roots, prior)
 
     def adapted(self, changes: Changes) -> LowRank | Conditioned:
         """The solution conditioned on these changes, or a new fit if they are many."""
@@ -182,8 +182,8 @@ class LowRank(Expansion):
         features = z.reshape(len(z), -1, channels).transpose(1, 0, 2)
         return features, self.inverse_factor.times(z, channels)
 
-    def explained(self, z: Array, roots: Array, prior: Array) -> Array:
-        """The covariances (M, O, O) of what is `whitened`, and the prior k(s, s) (C, C)."""
+    def covariance_of(self, z: Array, roots: Array, prior: Array) -> Array:
+        """The posterior covariances (M, O, O) of what is `whitened`, with the prior k(s, s)."""
         residual = kron_identity(prior - z.mT @ z, self.w.shape[1])
         return residual + self.hyperparameters.lambda_covariance * (roots.mT @ roots)
 
@@ -327,7 +327,7 @@ class Conditioned(Expansion):
         for i in range(d):
             split[:, :, i, :columns, i] += residual
         gain = system.solve(cross.reshape(m * c * d, -1).T).T.reshape(cross.shape)
-        return np.asarray(self.base.explained(z, roots, prior) - gain @ cross.mT)
+        return np.asarray(self.base.covariance_of(z, roots, prior) - gain @ cross.mT)
 
     @property
     def _added(self) -> int:

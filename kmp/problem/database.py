@@ -144,13 +144,13 @@ class Database(Immutable):
         values = np.flatnonzero(via.values)
         step = max(1, DISTANCES // len(self))
         for i in range(0, len(values), step):
-            some = values[i : i + step]
-            distance = _distances(via.inputs[some], self.inputs, period)  # (V, N)
+            block = values[i : i + step]
+            distance = _distances(via.inputs[block], self.inputs, period)  # (V, N)
             if self.functionals.directions is not None:
                 distance[:, ~self.functionals.values] = np.inf
             least = distance.min(axis=1)
             for n in np.flatnonzero(least < tolerance):
-                replaced[some[n]] = np.flatnonzero(distance[n] == least[n])
+                replaced[block[n]] = np.flatnonzero(distance[n] == least[n])
         return replaced
 
 

@@ -248,7 +248,7 @@ def main(arguments: list[str] | None = None) -> int:
         scene, moved = scene.in_reach(cell_of(args.arm).reach)
     except (SceneError, SettingsError) as error:
         print(error, file=sys.stderr)
-        return 1
+        return error.exit_code if isinstance(error, SettingsError) else 1
     for line in moved:
         print(line, file=sys.stderr)
     print(requests.encode_json(requests.Add(scene.via_points(gripper=args.gripper))).decode())

@@ -265,11 +265,9 @@ def main(arguments: list[str] | None = None) -> int:
             path = args.output / f"demonstration-{number}.mcap"
             write_demonstration(path, taught, cell=reach.cell)
             print(path)
-    except SettingsError as error:
-        p.error(str(error))
-    except (SceneError, OSError) as error:
+    except (SettingsError, SceneError, OSError) as error:
         print(f"python -m thirdhand_sim.teach: {in_words(error)}", file=sys.stderr)
-        return 1
+        return error.exit_code if isinstance(error, SettingsError) else 1
     return 0
 
 

@@ -219,12 +219,12 @@ def test_view_without_a_screen_is_refused_first(monkeypatch: pytest.MonkeyPatch)
         ),
         (2, "COMMAND", ()),
         (
-            1,
+            2,
             "no arm 'panda': wam, franka, ur5, or a cell's settings (FILE.toml) needed",
             ("demo", "--arm", "panda"),
         ),
         (
-            1,
+            2,
             "no arm 'panda': wam, franka, ur5, or a cell's settings (FILE.toml) needed",
             ("sim", "--arm", "panda"),
         ),

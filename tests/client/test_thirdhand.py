@@ -22,6 +22,7 @@ import pytest
 import zenoh
 
 from support.cell import serving, until
+from support.cell_commands import started
 from support.installed import isolated, unpacked, wheel_of
 from support.paths import ROOT
 from thirdhand.client import (
@@ -469,6 +470,21 @@ def test_own_hands_that_are_not_two_are_refused(
     with pytest.raises(ExplainedError) as said:
         Seen(hands).publish(cell.session, "bench", is_over=lambda: False)
     assert f"Seen.read gives {hands!r}; the poses of the left and of the" in str(said.value)
+
+
+def test_sigterm_ends_own_hands_with_exit_code_0(tmp_path: Path) -> None:
+    file = tmp_path / "mine.py"
+    file.write_text(
+        "import thirdhand\nclass Mine(thirdhand.Hands):\n  def read(self): return None, None\n"
+    )
+    with (
+        serving(tmp_path) as daemon,
+        started("hands", "--own", f"{file}:Mine", "--connect", daemon.endpoint) as command,
+    ):
+        assert command.stderr is not None
+        assert "publishing the hands of" in command.stderr.readline()
+        command.terminate()
+        assert command.wait(10) == 0
 
 
 def test_a_frame_that_the_cell_does_not_know_is_said(

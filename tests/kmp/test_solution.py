@@ -119,6 +119,3 @@ def test_lost_point_is_refused_where_replaced():
 
 
 # --- a primitive that grows by points ---
-
-
-RANDOM = np.random.default_rng(0)

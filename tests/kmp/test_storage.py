@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 
 import kmp
-from kmp import KMP, GaussianKernel, Gaussians, Matern52, RadialKernel, named_arrays
+from kmp import (
+    KMP,
+    GaussianKernel,
+    Gaussians,
+    LinearConstraints,
+    Matern52,
+    RadialKernel,
+    named_arrays,
+)
 from kmp.storage import checksum
 from support.primitives import skill
 
@@ -156,3 +164,24 @@ def test_gaussian_kernel_keeps_its_arrays():
     others = named_arrays.to_arrays(with_kernel(Matern52(2.0)))
     assert {str(others["kernel.kind"]), float(others["kernel.ell"])} == {"Matern52", 2.0}
     assert "ell" not in others  # so that earlier versions refuse it
+
+
+@pytest.mark.parametrize("name", ["kind", "inputs", "normals", "bounds"])
+def test_constraints_are_stored_whole_or_refused(name):
+    one = skill()
+    count = len(one.inputs)
+    bounds = one.mean(one.inputs)[:, 0] - 0.1
+    normals = np.tile(np.eye(one.outputs)[0], (count, 1))
+    arrays = named_arrays.to_arrays(one.constrained(LinearConstraints(one.inputs, normals, bounds)))
+    lacking = {key: array for key, array in arrays.items() if key != f"constraints.{name}"}
+    with pytest.raises(ValueError, match=rf"lack constraints\.{name}: give all of"):
+        named_arrays.from_arrays(lacking)
+    with pytest.raises(ValueError, match="AffineMean given, LinearConstraints needed"):
+        named_arrays.from_arrays(
+            arrays
+            | {
+                "constraints.kind": np.array("AffineMean"),
+                "constraints.matrix": np.ones((2, 1)),
+                "constraints.offset": np.ones(2),
+            }
+        )

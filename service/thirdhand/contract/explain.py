@@ -36,7 +36,7 @@ class ExplainedError(Exception):
     """
 
     exit_code: ClassVar[int] = 1
-    """Of commands."""
+    """Exit code of a command that this error ends."""
 
 
 class NotAcceptedError(ExplainedError, ValueError):

@@ -46,10 +46,11 @@ UNMEASURED_SHARE = 1e-6
 LEAST_BATCHES = 3  # with fewer pauses than this, a hand was out of sight
 ARM_STATE = "joints/state"
 TOOL_WISH = "tool/wish"
-# After a hold-up a network delivers many messages at once. A tick reads at most the newest of them.
+# After a hold-up a network delivers many messages at once. `receive`, which a tick calls once or
+# twice, reads at most the newest of them.
 MAX_ARRIVALS = 4  # messages of a hand
-MAX_WISHES = 128  # that wait; a chunk is read over several ticks, as it is long
-MAX_WISHES_READ = 16  # in a tick
+MAX_WISHES = 128  # that wait; a chunk is long, and read over several ticks
+MAX_WISHES_READ = 16  # at once
 # messages of the arm's topic, on which grippers and other parts may publish too
 MAX_JOINT_STATES = 16
 # messages of a topic of transforms, on which all nodes publish: 64 ms at 1 kHz
@@ -418,7 +419,7 @@ def _is_heard(channel: channels.Channel, settings: Settings) -> bool:
 
 
 def _most(suffix: str) -> int:
-    """Largest number of messages of a channel that are read in one tick."""
+    """Largest number of messages of a channel that are read at once."""
     most = {ARM_STATE: MAX_JOINT_STATES, TOOL_WISH: MAX_WISHES_READ}
     return most.get(suffix, MAX_ARRIVALS)
 

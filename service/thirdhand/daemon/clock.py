@@ -20,7 +20,7 @@ from thirdhand.contract.requests import Percentiles
 from thirdhand.core.frame import STAGES, Frame, Record, Vector, timed
 
 SPIN_NS = 100_000  # busy waiting before a deadline, only under real-time scheduling
-# the next tick is prepared within this time; at 430 µs, one deadline of 100 was 0.1 to 0.26 ms late
+# the next tick is prepared within this time; at 430 µs, one tick of 100 was 0.1 to 0.26 ms late
 PREPARING_NS = 560_000
 PREPARE_NS = 3 * PREPARING_NS // 2  # preparation begins this long before the deadline
 BESIDE_NS = 300_000  # work beside the loop is done in parts, most of which take less

@@ -22,6 +22,7 @@ from thirdhand.core.warm_up import warm_up
 from thirdhand.daemon import supervised_thread
 from thirdhand.daemon.answers import Answers
 from thirdhand.daemon.cell_state import CellState
+from thirdhand.daemon.cell_streams import TOOL_WISH
 from thirdhand.daemon.clock import (
     PREPARE_NS,
     SPIN_NS,
@@ -70,7 +71,6 @@ class Daemon:
         """`skills` is the folder from which clients load skills."""
         self._cell = cell
         self._newest = -1  # index of the newest tick
-        self._has_wishes = cell.settings.skill.has_wishes  # compared with the time of their tick
         self._rehearsal = Tick(-1), cell.frame  # the rehearsed tick, and its frame
         self._received: list[Event] = []  # the messages for the next tick that came before it
         self._failed_at: int | None = None  # tick of the loop's last failure
@@ -184,10 +184,14 @@ class Daemon:
             self._publish(tick, self._step(tick))
 
     def _step(self, tick: Tick) -> Frame:
-        """The frame of a tick: the rehearsed one, bit for bit, if the tick takes in the same."""
+        """The frame of a tick: the rehearsed one, bit for bit, if the tick takes in the same.
+
+        Wishes are compared with the time of their tick, which the rehearsal does not know.
+        """
         controller = self._cell.controller
         rehearsed, frame = self._rehearsal
-        if (tick.index, tick.inbox) != (rehearsed.index, rehearsed.inbox) or self._has_wishes:
+        is_rehearsed = (tick.index, tick.inbox) == (rehearsed.index, rehearsed.inbox)
+        if not is_rehearsed or any(event.kind == TOOL_WISH for event in tick.inbox):
             return controller.step(tick, self._cell.times.lap)
         controller.copy_from(self._twin)
         return frame

@@ -22,7 +22,9 @@ Accepted: TypeAlias = tuple[Callable[[Any], bool], str]
 
 
 def own_class(place: str, kind: type[Kind]) -> type[Kind]:
-    """The class at a place, which must be one of this kind. Raises ExplainedError."""
+    """The class at a place, which must be one of this kind. Raises NotAcceptedError, or
+    ExplainedError if its module fails.
+    """
     module, _, name = place.rpartition(":")
     if not module:
         raise NotAcceptedError(f"{place}: MODULE:CLASS or FILE.py:CLASS needed")
@@ -31,7 +33,7 @@ def own_class(place: str, kind: type[Kind]) -> type[Kind]:
     if not (isinstance(found, type) and issubclass(found, kind)):
         raise NotAcceptedError(f"{place} is no class of thirdhand.{kind.__name__}")
     if missing := sorted(getattr(found, "__abstractmethods__", ())):
-        raise ExplainedError(
+        raise NotAcceptedError(
             f"{place} has no {', '.join(missing)}, which a class of thirdhand.{kind.__name__} needs"
         )
     return found

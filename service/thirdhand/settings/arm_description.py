@@ -19,7 +19,7 @@ MAX_URDF_BYTES = 20_000_000  # a humanoid's URDF has 0.1 MB
 
 def description(path: Path, packages: tuple[str, ...] = (), *, cover: bool = True) -> str:
     """An arm's URDF, with a capsule around each collision mesh if `cover`. Meshes are found in
-    `packages`, or in folders above the URDF. Raises SettingsError.
+    `packages`, or in folders above the URDF. Raises SettingsError, UnreadableError.
     """
     try:
         text = _text(path)

@@ -708,7 +708,8 @@ def converted(given: Any, *, origin: str, folder: Path | None = None) -> Setting
         if settings.arm.urdf:
             settings = _with_reach(settings, urdf, set(reach) if isinstance(reach, dict) else set())
     except (UrdfError, SettingsError, InvalidError) as error:
-        raise SettingsError(f"{origin}: {error}") from None
+        kind = UnreadableError if isinstance(error, UnreadableError) else SettingsError
+        raise kind(f"{origin}: {error}") from None
     return settings
 
 

@@ -39,10 +39,13 @@ TOKEN_LENGTH = 12  # 62 bits, and few enough to type on a headset
 
 def hands(args: argparse.Namespace) -> int:
     """Publish hands until Ctrl-C; exit code 0 if a video file or SIGTERM ends it."""
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
-    if args.own:
-        return _own(args)
-    return _camera(args) if args.camera is not None else _web(args)
+    before = signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
+    try:
+        if args.own:
+            return _own(args)
+        return _camera(args) if args.camera is not None else _web(args)
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _own(args: argparse.Namespace) -> int:

@@ -203,7 +203,7 @@ def text(report: dict[str, Any]) -> str:
         ("round_trip_ms", "there and back by Zenoh ms"),
     ):
         rows.append(_row(label, whole[name], 2))
-    rows += [_row(f"of it, {name} µs", stage, 1) for name, stage in whole["stages_us"].items()]
+    rows += [_row(f"stage {name} µs", stage, 1) for name, stage in whole["stages_us"].items()]
     rows += [
         f"    {process:<12}{usage['memory_mb']:6.0f} MB, {usage['cpu_s']:5.1f} s of processor"
         for process, usage in whole["processes"].items()
