@@ -168,11 +168,13 @@ def test_gaussian_kernel_keeps_its_arrays():
 
 @pytest.mark.parametrize("name", ["kind", "inputs", "normals", "bounds"])
 def test_constraints_are_stored_whole_or_refused(name):
-    one = skill()
-    count = len(one.inputs)
-    bounds = one.mean(one.inputs)[:, 0] - 0.1
-    normals = np.tile(np.eye(one.outputs)[0], (count, 1))
-    arrays = named_arrays.to_arrays(one.constrained(LinearConstraints(one.inputs, normals, bounds)))
+    free = skill()
+    count = len(free.inputs)
+    bounds = free.mean(free.inputs)[:, 0] - 0.1
+    normals = np.tile(np.eye(free.outputs)[0], (count, 1))
+    arrays = named_arrays.to_arrays(
+        free.constrained(LinearConstraints(free.inputs, normals, bounds))
+    )
     lacking = {key: array for key, array in arrays.items() if key != f"constraints.{name}"}
     with pytest.raises(ValueError, match=rf"lack constraints\.{name}: give all of"):
         named_arrays.from_arrays(lacking)
