@@ -127,8 +127,9 @@ def test_report_and_picture_and_recording_are_kept(kept: Path) -> None:
     assert whole["ticks"] == pytest.approx(ticks, abs=0.1 * ticks)
     assert sum(whole["work_counts"]) == pytest.approx(ticks, abs=0.1 * ticks)
     segments = sum(stage["p50"] for stage in whole["stages_us"].values())
-    # most ticks are rehearsed before their deadline, and work is what is left after it
-    assert 0.2 < segments / report["core"]["work_us"]["p50"] < 1.1
+    # most ticks are rehearsed before their deadline, in colder caches than those of the core alone,
+    # and work is what is left after it
+    assert 0.2 < segments / report["core"]["work_us"]["p50"] < 2
     assert whole["work_us"]["p50"] < segments
     assert {"daemon", "fork server", "scribe", "skill worker"} == set(whole["processes"])
     assert (kept / "bench.png").read_bytes().startswith(b"\x89PNG")

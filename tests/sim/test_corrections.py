@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from support.cell import LEFT, Daemon, Tracker, serving, told
+from support.cell import LEFT, LISTENING, Daemon, Tracker, serving, told
 from support.guided_bench import GuidedBench
 from thirdhand.client import RefusedError
 from thirdhand.contract.records import Flag, Mode, Reason
@@ -21,6 +21,8 @@ from thirdhand.recordings.replay import replay
 from thirdhand.settings.config import Settings
 
 RATE_HZ = 100  # ticks of 10 ms leave time for the simulated arm on a busy machine
+# on which the simulated arm, a thread of the tests, may be silent for more than 0.1 s
+PATIENT = LISTENING + "[arm]\nsilent_ms = 1000\n"
 HALFWAY = (0.80, -0.31, 0.19)  # left hand on its way to the handover
 # [rad] motion by hand, larger than the allowed error of an arm
 LED = np.array([0.12, -0.1, 0.0, 0.12, 0.0, 0.0, 0.0])
@@ -61,7 +63,9 @@ def test_correction_from_end_to_end(tmp_path: Path) -> None:  # noqa: PLR0915 - 
     settings = msgspec.structs.replace(Settings(), rate_hz=RATE_HZ)
     records = tmp_path / "records"
     with (
-        serving(tmp_path, "--rate", str(RATE_HZ), "--record", str(records)) as daemon,
+        serving(
+            tmp_path, "--rate", str(RATE_HZ), "--record", str(records), network=PATIENT
+        ) as daemon,
         Tracker(daemon.session) as tracker,
         GuidedBench(daemon.session, settings) as bench,
     ):
