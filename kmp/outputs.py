@@ -11,7 +11,7 @@ Over C channels, T is the same for the values and for their rates: I (x) T.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -80,8 +80,10 @@ def _basis(root: NDArray[Any], covariance: Array) -> Array | None:
     return np.asarray(np.linalg.eigh(inner)[1], dtype=np.float64)
 
 
-def _inner_parameters(parameters: Hyperparameters, t: Array) -> Hyperparameters:
-    """The parameters in the coordinates x = T^-1 y."""
+def _inner_parameters(parameters: Hyperparameters, t: Array | None) -> Hyperparameters:
+    """The parameters in the coordinates x = T^-1 y; T None is the identity."""
+    if t is None:
+        return parameters
     inverse = np.linalg.inv(t)
     return replace(
         parameters,
@@ -254,7 +256,8 @@ class Mapped(Expansion):
     def adapted(self, changes: Changes) -> Solution:
         points = changes.points
         if self.t is not None:
-            points = inside(self._inner_parameters, changes.functionals, self.t, points)
+            inner = _inner_parameters(self.hyperparameters, self.t)
+            points = inside(inner, changes.functionals, self.t, points)
         if not self._is_decoupled(points):
             return self._together.adapted(changes)
         parts = tuple(
@@ -264,12 +267,11 @@ class Mapped(Expansion):
         return replace(self, database=self.database.changed(changes), parts=parts)
 
     def with_hyperparameters(self, hyperparameters: Hyperparameters) -> Mapped:
-        changed = replace(self, hyperparameters=hyperparameters)
-        inner = changed._inner_parameters  # noqa: SLF001 (of its own kind)
+        inner = _inner_parameters(hyperparameters, self.t)
         parts = tuple(
             part.with_hyperparameters(_parameters_of(inner, group)) for part, group in self._pairs
         )
-        return replace(changed, parts=parts)
+        return replace(self, hyperparameters=hyperparameters, parts=parts)
 
     def to_arrays(self) -> dict[str, NDArray[np.float64]]:
         stored: list[dict[str, NDArray[np.float64]]] = [part.to_arrays() for part in self.parts]
@@ -283,22 +285,19 @@ class Mapped(Expansion):
     def _pairs(self) -> Iterator[tuple[Any, NDArray[np.intp]]]:
         return zip(self.parts, self.groups, strict=True)
 
-    @property
-    def _inner_parameters(self) -> Hyperparameters:
-        t = self.t
-        return self.hyperparameters if t is None else _inner_parameters(self.hyperparameters, t)
-
     @cached_property
     def _together(self) -> BaseSolution:
         """The solution with all coordinates as one system."""
-        problem = inner_problem(self.hyperparameters, self.database, self.t)
         first = self.parts[0]
-        is_low_rank = isinstance(first, LowRank)
-        system = LowRank.fit(*problem, first.features) if is_low_rank else Dense(*problem)
-        return self._around(system)
+        if isinstance(first, LowRank):
+            return self.as_one(lambda p, d: LowRank.fit(p, d, first.features))
+        return self.as_one(Dense)
 
-    def _around(self, system: Dense | LowRank) -> BaseSolution:
-        """The solution of the same problem by one system for all coordinates."""
+    def as_one(
+        self, solution: Callable[[Hyperparameters, Database], Dense | LowRank]
+    ) -> BaseSolution:
+        """The same problem by one `solution(parameters, database)` of all coordinates."""
+        system = solution(*inner_problem(self.hyperparameters, self.database, self.t))
         if self.t is None:
             return system
         return Mapped.around(self.hyperparameters, self.database, self.t, system)
@@ -364,18 +363,20 @@ def as_one(base: Solution) -> BaseSolution:
     """The dense solution of a base as one system, to which constraints can be added."""
     if is_one(base):
         return cast(BaseSolution, base)
-    if not isinstance(base, Mapped):
-        return Dense(base.hyperparameters, base.database)
-    return base._around(Dense(*inner_problem(base.hyperparameters, base.database, base.t)))  # noqa: SLF001
+    if isinstance(base, Mapped):
+        return base.as_one(Dense)
+    return Dense(base.hyperparameters, base.database)
 
 
 def constrained(solution: Solution, constraints: LinearConstraints) -> Solution:
     """A solution as one system, with these constraints."""
     if isinstance(solution, Mapped):
-        t = solution.t
-        normals = constraints.normals if t is None else constraints.normals @ t
+        assert solution.t is not None, "as one"
         inner = LinearConstraints(
-            constraints.inputs, normals, constraints.bounds, constraints.directions
+            constraints.inputs,
+            constraints.normals @ solution.t,
+            constraints.bounds,
+            constraints.directions,
         )
         parts = (constrained(solution.parts[0], inner),)
         return replace(solution, parts=parts, constraints=constraints)

@@ -24,7 +24,7 @@ from kmp.low_rank import Features
 from kmp.problem.database import Changes, Database
 from kmp.problem.hyperparameters import AffineMean
 from kmp.query import MotionPrediction, Query
-from kmp.solution import BLOCK, Solution, mean_at
+from kmp.solution import BLOCK, Solution, mean_at, mean_of_rows
 
 _RESIDUAL = 1e-10  # residual of the features, as a share of k(s, s), in the uncertainty by distance
 
@@ -104,15 +104,19 @@ class Predictor(Immutable):
         if compiled is not None and (mean_and_row := self._compiled_mean(s)) is not None:
             return unchecked(mean_and_row[0], compiled.covariance(mean_and_row[1])[None])
         s = self._checked_many(s)
-        prior = self.kernel.prior_variance
-        posterior = [
-            self.inner.solution.posterior_covariance(self._rows(s[i : i + BLOCK]), prior)
-            for i in range(0, len(s), BLOCK)
-        ]
-        stacked = (
-            np.concatenate(posterior) if posterior else np.empty((0, self.outputs, self.outputs))
-        )
-        return unchecked(self.mean(s), self._scaled(stacked))
+        solution = self.inner.solution
+        mean_and_row = self._compiled_mean(s)
+        mean = np.empty((len(s), self.outputs)) if mean_and_row is None else mean_and_row[0]
+        posterior = np.empty((len(s), self.outputs, self.outputs))
+        for a in range(0, len(s), BLOCK):
+            block = Functionals(s[a : a + BLOCK])
+            rows = between(self.kernel, block, solution.functionals)
+            posterior[a : a + BLOCK] = solution.posterior_covariance(
+                rows, self.kernel.prior_variance
+            )
+            if mean_and_row is None:
+                mean[a : a + BLOCK] = mean_of_rows(solution, block, rows)
+        return unchecked(mean, self._scaled(posterior))
 
     def predict_joint(self, queries: ArrayLike) -> Gaussians:
         """xi(s) at queries (M, I) as one normal over all M O outputs, query after query.
@@ -123,7 +127,8 @@ class Predictor(Immutable):
         s = self._checked_many(queries)
         if len(s) == 0:
             raise ValueError("queries: none given, at least 1 needed.")
-        posterior = self.inner.solution.posterior_covariance(self._rows(s), self.kernel(s, s))
+        rows = between(self.kernel, Functionals(s), self.inner.solution.functionals)
+        posterior = self.inner.solution.posterior_covariance(rows, self.kernel(s, s))
         return unchecked(self.mean(s).reshape(1, -1), self._scaled(posterior))
 
     def sample(self, queries: ArrayLike, count: int, *, seed: Seed = 0) -> Array:
@@ -246,10 +251,6 @@ class Predictor(Immutable):
     @cached_property
     def _dimensions(self) -> int:
         return int(self.inner.solution.database.inputs.shape[1])
-
-    def _rows(self, queries: Array) -> Array:
-        """k (M C, R C) between M queries and the solution's functionals."""
-        return between(self.kernel, Functionals(queries), self.inner.solution.functionals)
 
     def _scaled(self, posterior: Array) -> Array:
         """N / lambda_c times posterior covariances (M, n, n), made positive semi-definite."""

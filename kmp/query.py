@@ -19,7 +19,7 @@ from kmp.arrays.immutable import Immutable
 from kmp.arrays.linear_algebra import nearest_positive_semidefinite
 from kmp.functionals import Functionals
 from kmp.kernel import Kernel, between, third_derivative
-from kmp.solution import Solution
+from kmp.solution import Solution, mean_of_rows
 
 
 class MotionPrediction(NamedTuple):
@@ -64,15 +64,6 @@ class Query(Immutable):
         """The kernel k."""
         return self.solution.hyperparameters.kernel
 
-    def row(self, query: Array) -> Array:
-        """The kernel row of a query (I,): k(s, s_r) (C, R C)."""
-        return between(self.kernel, Functionals(query[None]), self.solution.functionals)
-
-    def mean(self, query: Array, row: Array) -> Array:
-        """xi(s) (O,). Equation (8)."""
-        prior = self.prior_mean
-        return np.asarray((row @ self.weights).ravel() + prior[:, 0] + prior[:, 1:] @ query)
-
     def covariance(self, row: Array) -> Array:
         """N / lambda_c (k(s, s) I - k (K + lambda_c Sigma)^-1 k^T) (O, O), for a row. IJRR."""
         posterior = self.solution.posterior_covariance(row, self.kernel.prior_variance)
@@ -113,11 +104,12 @@ class Query(Immutable):
         """The output at a query (I,), and its motion by the query's velocity and acceleration
         (I,).
         """
-        row = self.row(query)
+        point = Functionals(query[None])
+        row = between(self.kernel, point, self.solution.functionals)
         jacobian = self.jacobians(query[None])[0]
         curvature = self.curvature(query, velocity)
         return MotionPrediction(
-            self.mean(query, row),
+            mean_of_rows(self.solution, point, row)[0],
             jacobian @ velocity,
             jacobian @ acceleration + curvature,
             self.covariance(row) if covariance else None,

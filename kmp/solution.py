@@ -111,13 +111,20 @@ def mean_of(solution: Solution, queries: Functionals) -> Array:
     Computed in blocks of queries, whose kernel rows stay in the processor's cache.
     """
     parameters = solution.hyperparameters
-    weights = solution.weights.reshape(-1, parameters.channel_outputs)
-    means = np.empty((len(queries) * parameters.kernel.channels, parameters.channel_outputs))
+    means = np.empty((len(queries), parameters.outputs))
     for a in range(0, len(queries), BLOCK):
         block = queries.take(slice(a, a + BLOCK)) if len(queries) > BLOCK else queries
         rows = between(parameters.kernel, block, solution.functionals)
-        means[a * parameters.kernel.channels :][: len(rows)] = rows @ weights
-    return np.asarray(means.reshape(-1, parameters.outputs) + parameters.prior_at(queries))
+        means[a : a + BLOCK] = mean_of_rows(solution, block, rows)
+    return means
+
+
+def mean_of_rows(solution: Solution, queries: Functionals, rows: Array) -> Array:
+    """Equation (8) for M functionals whose kernel rows (M C, R C) are known: (M, O)."""
+    parameters = solution.hyperparameters
+    weights = solution.weights.reshape(-1, parameters.channel_outputs)
+    means = (rows @ weights).reshape(-1, parameters.outputs)
+    return np.asarray(means + parameters.prior_at(queries))
 
 
 def check_resolved(

@@ -211,7 +211,8 @@ def test_one_scale_keeps_ratio_of_lengths():
 
 
 def database():
-    dimensions, outputs = 3, 2
+    dimensions = 3
+    outputs = 2
     random = np.random.default_rng(0)
     inputs = random.uniform(0, 2, (20, dimensions))
     roots = 0.1 * random.normal(size=(20, outputs, outputs)) + 0.2 * np.eye(outputs)

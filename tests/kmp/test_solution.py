@@ -3,12 +3,7 @@
 import numpy as np
 import pytest
 
-from kmp import (
-    KMP,
-    GaussianKernel,
-    Gaussians,
-    named_arrays,
-)
+from kmp import KMP, GaussianKernel, Gaussians, named_arrays
 from kmp.dense import Dense
 from kmp.low_rank import LowRank
 from kmp.low_rank.solution import Conditioned
@@ -116,6 +111,3 @@ def test_lost_point_is_refused_where_replaced():
     twice = Gaussians(np.zeros((2, 2)), np.tile(1e-18 * np.eye(2), (2, 1, 1)))
     with pytest.raises(ValueError, match="at point 39"):
         base.adapt([[3.0], [3.0]], twice, tolerance=0.1)
-
-
-# --- a primitive that grows by points ---
