@@ -13,7 +13,7 @@ import os
 
 from thirdhand.cli.options import RUN_TIME
 from thirdhand.cli.usage import AddCommand, Parser, reaching
-from thirdhand.contract.explain import ExplainedError, in_file, in_words
+from thirdhand.contract.explain import ExplainedError, exit_code_of, in_file, in_words
 from thirdhand.process import foreign_modules, interrupt
 from thirdhand.process.progress import say
 from thirdhand.workbench.cli.options import WORKBENCH
@@ -84,6 +84,6 @@ def main(arguments: list[str] | None = None) -> int:
         return 1
     except (ExplainedError, OSError) as error:
         say(f"thirdhand {args.command}: {in_file(in_words(error))}")
-        return error.exit_code if isinstance(error, ExplainedError) else 1
+        return exit_code_of(error)
     except KeyboardInterrupt:
         interrupt.end_at_once()

@@ -19,7 +19,7 @@ from typing import Annotated
 import msgspec
 
 from thirdhand.contract import requests
-from thirdhand.contract.explain import in_words, validated
+from thirdhand.contract.explain import exit_code_of, in_words, validated
 from thirdhand.recordings.shipped import ARMS, cell_of
 from thirdhand.settings.config import Reach
 from thirdhand.settings.file_content import SettingsError, UnusableError, text_in, toml_in
@@ -248,7 +248,7 @@ def main(arguments: list[str] | None = None) -> int:
         scene, moved = scene.in_reach(cell_of(args.arm).reach)
     except (SceneError, SettingsError) as error:
         print(error, file=sys.stderr)
-        return error.exit_code if isinstance(error, SettingsError) else 1
+        return exit_code_of(error)
     for line in moved:
         print(line, file=sys.stderr)
     print(requests.encode_json(requests.Add(scene.via_points(gripper=args.gripper))).decode())

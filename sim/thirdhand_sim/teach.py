@@ -20,7 +20,7 @@ from thirdhand.cli.usage import option
 from thirdhand.client import ClientSettings, Publisher, client_settings
 from thirdhand.contract import cdr
 from thirdhand.contract.channels import ENDPOINT
-from thirdhand.contract.explain import in_words
+from thirdhand.contract.explain import exit_code_of, in_words
 from thirdhand.contract.messages import BASE, PoseStamped
 from thirdhand.contract.requests import ViaPoint
 from thirdhand.settings.file_content import SettingsError
@@ -267,7 +267,7 @@ def main(arguments: list[str] | None = None) -> int:
             print(path)
     except (SettingsError, SceneError, OSError) as error:
         print(f"python -m thirdhand_sim.teach: {in_words(error)}", file=sys.stderr)
-        return error.exit_code if isinstance(error, SettingsError) else 1
+        return exit_code_of(error)
     return 0
 
 

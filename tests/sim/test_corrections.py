@@ -21,7 +21,7 @@ from thirdhand.recordings.replay import replay
 from thirdhand.settings.config import Settings
 
 RATE_HZ = 100  # ticks of 10 ms leave time for the simulated arm on a busy machine
-# on which the simulated arm, a thread of the tests, may be silent for more than 0.1 s
+# The simulated arm is a thread of the tests, and may be silent there for more than 0.1 s.
 PATIENT = LISTENING + "[arm]\nsilent_ms = 1000\n"
 HALFWAY = (0.80, -0.31, 0.19)  # left hand on its way to the handover
 # [rad] motion by hand, larger than the allowed error of an arm

@@ -18,8 +18,8 @@ from thirdhand.settings.config import Settings
 
 
 def follow(args: argparse.Namespace) -> int:
-    """Drive the arm until Ctrl-C; exit code 0 with the arm at rest. Raises
-    NotAcceptedError, DriveError, UnreachableError.
+    """Drive the arm until Ctrl-C; exit code 0 with the arm at rest. Raises NotAcceptedError,
+    DriveError, UnreachableError.
     """
     place = place_of(args.arm)
     settings = cell_of(str(args.config)) if args.config else Settings()

@@ -17,7 +17,7 @@ from typing import Any
 import msgspec
 
 from thirdhand.cli.usage import UsageError, end_with
-from thirdhand.contract.explain import ExplainedError, in_file, in_words
+from thirdhand.contract.explain import ExplainedError, exit_code_of, in_file, in_words
 from thirdhand.contract.printable import CLEAR, printable_lines
 from thirdhand.daemon.start import starting
 from thirdhand.process import child, foreign_modules
@@ -50,7 +50,7 @@ def serve(args: argparse.Namespace) -> int:
             in_file(in_words(error)),
             exc_info=not isinstance(error, OSError | ValueError | ExplainedError),
         )
-        return error.exit_code if isinstance(error, ExplainedError) else 1
+        return exit_code_of(error)
 
 
 def _run(args: argparse.Namespace) -> int:

@@ -36,13 +36,18 @@ class ExplainedError(Exception):
     """
 
     exit_code: ClassVar[int] = 1
-    """Exit code of a command that this error ends."""
+    """See `exit_code_of`."""
 
 
 class NotAcceptedError(ExplainedError, ValueError):
     """A command line or configuration is not accepted."""
 
     exit_code = 2
+
+
+def exit_code_of(error: BaseException) -> int:
+    """Exit code of a command that an error ends."""
+    return error.exit_code if isinstance(error, ExplainedError) else 1
 
 
 def in_words(error: BaseException, *, named: bool = True) -> str:
