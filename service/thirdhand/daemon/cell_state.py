@@ -15,10 +15,11 @@ from thirdhand.core.separation import FARTHEST_REPORTED_M
 from thirdhand.daemon.cell_streams import CellStreams
 from thirdhand.daemon.clock import Deadlines, Granted, TickTimes
 from thirdhand.daemon.input_monitor import InputMonitor
+from thirdhand.daemon.rehearsed_controller import RehearsedController
 from thirdhand.daemon.request_inbox import RequestInbox
 from thirdhand.daemon.start import Startup
 from thirdhand.scribe.scribe import Scribe
-from thirdhand.settings.config import Settings, robot_description
+from thirdhand.settings.config import Settings
 from thirdhand.skills.skill_file import StoredSkill
 
 log = logging.getLogger("thirdhand")
@@ -82,7 +83,7 @@ class CellState:
     """The controller of one cell and its newest frame, the skills in force, what arrives for the
     loop and waits for it, its times, and the notes and failures of the service.
 
-    The loop alone steps `controller`, sets `frame`, and uses `receive` of the streams.
+    The loop alone uses `core`, sets `frame`, and uses `receive` of the streams.
     """
 
     def __init__(
@@ -93,7 +94,7 @@ class CellState:
         self.start = start
         self.endpoints = endpoints(start.session) if settings.network.listen else ()
         start.lock.announce(self.endpoints)
-        self.controller = Controller(settings, skill.for_loop(), urdf=robot_description(settings))
+        self.core = RehearsedController(settings, skill.for_loop())
         self.clock = Deadlines(settings.rate_hz)
         self.times = TickTimes(settings.rate_hz)
         self.granted = Granted(realtime=False, memory_locked=False)
@@ -123,6 +124,11 @@ class CellState:
         self.newest_status = NewestStatus()
         self.failure = ""  # message of the service's last failure
         self._notes = (0, 0)  # time [s] and the number of notes in this second
+
+    @property
+    def controller(self) -> Controller:
+        """The controller in force, which another one may replace at each tick."""
+        return self.core.controller
 
     def moment(self) -> tuple[Frame, Record]:
         """The newest frame, and the state after it."""

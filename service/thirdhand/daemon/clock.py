@@ -62,6 +62,7 @@ class Deadlines:
         self._sleep = sleep
         self._start_ns = now_ns()
         self.stamp_ns = wall_ns() - self.period_ns
+        self._drift_ns = 0  # how far the system clock was ahead of the newest stamp
         self._index = -1
         self._sleeps_until_ns = 0
         # locked by `between_ticks`, released at the end of a tick
@@ -79,16 +80,18 @@ class Deadlines:
             self._is_in_tick.acquire(blocking=False)
             self._is_in_tick.acquire(timeout=NO_TICK_S)
 
-    def wait(self, prepare: Callable[[], None] | None = None) -> tuple[int, int]:
+    def wait(self, prepare: Callable[[int, int], None] | None = None) -> tuple[int, int]:
         """Wait for the next deadline and return its number and lateness [ns].
 
-        `prepare` is called PREPARE_NS before the deadline, unless it would end after it.
+        `prepare` is called PREPARE_NS before the deadline with its number and stamp, unless it
+        would end after the deadline. The stamp is another one if the clock is set meanwhile.
         """
         index = max(self._index + 1, (self._now_ns() - self._start_ns) // self.period_ns)
         passed = index - self._index
         self.missed += passed - 1
         self._index = index
         deadline = self._start_ns + index * self.period_ns
+        stamp_ns = self.stamp_ns + passed * self.period_ns + self._drift_ns // DRAW
         self._sleeps_until_ns = deadline - (self._spin_ns if prepare is None else PREPARE_NS)
         if self._is_in_tick.locked():
             self._is_in_tick.release()
@@ -96,18 +99,18 @@ class Deadlines:
         if prepare is not None:
             self._sleep_until(deadline - PREPARE_NS)
             if self._now_ns() < deadline - PREPARING_NS:
-                prepare()
+                prepare(index, stamp_ns)
         self._sleep_until(deadline - self._spin_ns)
         while (late := self._now_ns() - deadline) < 0:
             pass
 
-        # The stamp advances by whole periods, and follows the system clock.
-        due = self.stamp_ns + passed * self.period_ns
-        drift_ns = self._wall_ns() - late - due
-        if -STEP_NS < drift_ns < STEP_NS:
-            self.stamp_ns = due + drift_ns // DRAW
-        else:
-            self.stamp_ns = due + drift_ns if drift_ns > 0 else self.stamp_ns + CREEP_NS
+        drift_ns = self._wall_ns() - late - stamp_ns
+        if drift_ns >= STEP_NS:
+            stamp_ns += drift_ns
+        elif drift_ns <= -STEP_NS:
+            stamp_ns = self.stamp_ns + CREEP_NS
+        self._drift_ns = drift_ns if -STEP_NS < drift_ns < STEP_NS else 0
+        self.stamp_ns = stamp_ns
         return index, late
 
     def _sleep_until(self, at_ns: int) -> None:

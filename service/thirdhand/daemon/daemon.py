@@ -15,14 +15,12 @@ from thirdhand.contract import cdr
 from thirdhand.contract.explain import ExplainedError
 from thirdhand.contract.messages import Attachment
 from thirdhand.contract.requests import ViaPoint
-from thirdhand.core.controller import Controller, outgoing
-from thirdhand.core.frame import STAGES, Event, Frame, Outputs, Tick, order, timed
+from thirdhand.core.frame import Event, Tick, order
 from thirdhand.core.limiter.stage import Limiter
 from thirdhand.core.warm_up import warm_up
 from thirdhand.daemon import supervised_thread
 from thirdhand.daemon.answers import Answers
 from thirdhand.daemon.cell_state import CellState
-from thirdhand.daemon.cell_streams import TOOL_WISH
 from thirdhand.daemon.clock import (
     PREPARE_NS,
     SPIN_NS,
@@ -32,6 +30,7 @@ from thirdhand.daemon.clock import (
 )
 from thirdhand.daemon.compilation import NotCompiledError, compile_cell
 from thirdhand.daemon.queryables import Queryables
+from thirdhand.daemon.rehearsed_controller import DecidedTick
 from thirdhand.daemon.saved_via_points import SavedViaPoints
 from thirdhand.daemon.skill_worker import SkillWorker, skill_of
 from thirdhand.daemon.start import Startup
@@ -39,7 +38,6 @@ from thirdhand.daemon.status_thread import StatusThread
 from thirdhand.process.pages import release_start_memory
 from thirdhand.process.priority import ahead_of_others
 from thirdhand.recordings.shipped import SHIPPED_SKILL, recordings
-from thirdhand.scribe.protocol import pack
 from thirdhand.scribe.scribe import Scribe
 from thirdhand.settings.config import Settings, robot_description
 from thirdhand.skills.no_skill import leads_alone, no_skill, stand_in
@@ -70,15 +68,8 @@ class Daemon:
     def __init__(self, cell: CellState, skill_worker: SkillWorker, skills: Path) -> None:
         """`skills` is the folder from which clients load skills."""
         self._cell = cell
-        self._newest = -1  # index of the newest tick
-        self._rehearsal = Tick(-1), cell.frame  # the rehearsed tick, and its frame
         self._received: list[Event] = []  # the messages for the next tick that came before it
         self._failed_at: int | None = None  # tick of the loop's last failure
-
-        # A second controller rehearses the next tick, see `_warm_up`.
-        self._twin = Controller(
-            cell.settings, cell.controller.skill, urdf=robot_description(cell.settings)
-        )
 
         # Threads beside the loop make the status and answer requests.
         answers = Answers(cell, skill_worker, skills)
@@ -180,21 +171,9 @@ class Daemon:
     # --- the loop: every line below costs each tick ---
 
     def _run(self) -> None:
+        cell = self._cell
         for tick in self._ticks():
-            self._publish(tick, self._step(tick))
-
-    def _step(self, tick: Tick) -> Frame:
-        """The frame of a tick: the rehearsed one, bit for bit, if the tick takes in the same.
-
-        Wishes are compared with the time of their tick, which the rehearsal does not know.
-        """
-        controller = self._cell.controller
-        rehearsed, frame = self._rehearsal
-        is_rehearsed = (tick.index, tick.inbox) == (rehearsed.index, rehearsed.inbox)
-        if not is_rehearsed or any(event.kind == TOOL_WISH for event in tick.inbox):
-            return controller.step(tick, self._cell.times.lap)
-        controller.copy_from(self._twin)
-        return frame
+            self._publish(cell.core.decide(tick, cell.times.lap))
 
     def _ticks(self) -> Iterator[Tick]:
         """A tick at each deadline, with what arrived until then. After `stop`, each tick orders a
@@ -205,10 +184,9 @@ class Daemon:
         stop_by: float | None = None
         # A period of 1 ms has no time to prepare the next tick.
         has_time = cell.clock.period_ns >= 2 * PREPARE_NS
-        prepare = self._warm_up if has_time and cell.settings.loop.prepare else None
+        prepare = self._rehearse if has_time and cell.settings.loop.prepare else None
         while True:
             index, late_ns = cell.clock.wait(prepare)
-            self._newest = index
             cell.times.begin(late_ns)
             if cell.stop.is_set():
                 if stop_by is None:
@@ -233,32 +211,20 @@ class Daemon:
             yield Tick(index, tuple(inbox), cell.clock.stamp_ns)
             requests.answer(cell.frame)  # the frame of this tick
 
-    def _warm_up(self) -> None:
-        """Read the messages that have come for the next tick. Then run a copy of the controller on
-        them, from received to published bytes. If no more come, its frame is that of the tick; if
-        some do, code and data are in the processor's caches.
-        """
+    def _rehearse(self, index: int, time_ns: int) -> None:
+        """Read the messages that have come for the next tick, and rehearse it with them."""
         cell = self._cell
         self._received = cell.streams.receive(self._received)
-        self._twin.copy_from(cell.controller)
-        tick = Tick(self._newest + 1, tuple(self._received), cell.clock.stamp_ns)
         cell.times.begin(0)
-        frame = self._twin.step(tick, cell.times.lap)
-        self._rehearsal = tick, frame
-        _, outputs = self._messages(frame)
-        timing = timed(tick.index, 0, 0, 0.0, 0.0, 0.0, [0.0] * len(STAGES))
-        pack(tick, frame, timing, state=None, lost=0, with_skill=False, outputs=outputs)
+        cell.core.rehearse(Tick(index, tuple(self._received), time_ns), cell.times.lap)
 
-    def _messages(self, frame: Frame) -> tuple[bytes, Outputs]:
-        """The attachment and the messages, by channel, that are published for a frame."""
-        attachment = Attachment(int(frame["tick"]), time.time_ns(), int(frame["hand_stamp_ns"]))
-        outputs = outgoing(frame, self._cell.clock.stamp_ns, self._cell.settings.joints.names)
-        return cdr.encode_attachment(attachment), outputs
-
-    def _publish(self, tick: Tick, frame: Frame) -> None:
+    def _publish(self, decided: DecidedTick) -> None:
         """Publish and record what a tick decided."""
         cell = self._cell
-        attachment, outputs = self._messages(frame)
+        tick, frame, outputs = decided
+        attachment = cdr.encode_attachment(
+            Attachment(tick.index, time.time_ns(), int(frame["hand_stamp_ns"]))
+        )
         for key, payload in outputs:
             cell.streams.publish(key, payload, attachment)
         cell.frame = frame
