@@ -32,6 +32,7 @@ HEALTHY = Status(
     missed=3,
     realtime=True,
     memory_locked=True,
+    awake=True,
     skill="soldering",
     via_points=(),
     rejected={},

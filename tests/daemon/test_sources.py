@@ -85,6 +85,7 @@ class Cell:
             "missed": 0,
             "realtime": True,
             "memory_locked": True,
+            "awake": True,
             "scribe": {},
             "endpoints": (),
         }

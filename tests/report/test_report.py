@@ -54,6 +54,7 @@ FIELDS: dict[str, Any] = {  # fields of a status that do not come from the core
     "missed": 0,
     "realtime": True,
     "memory_locked": True,
+    "awake": True,
     "scribe": {},
     "endpoints": (),
     "version": "",

@@ -22,6 +22,7 @@ def holding(cell: str, tick: int) -> Status:
         version="",
         realtime=False,
         memory_locked=False,
+        awake=False,
         **numbers,
         **dict.fromkeys(("flags", "via_points", "endpoints"), ()),
         **{name: {} for name in ("rejected", "hand_age_ms", "scribe")},

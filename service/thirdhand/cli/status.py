@@ -182,7 +182,8 @@ def _outcome(now: Status) -> dict[str, str]:
 
 def _scheduling(now: Status) -> str:
     granted = "real time" if now.realtime else "ordinary: real time was not granted"
-    return f"{granted}, memory {'' if now.memory_locked else 'not '}locked"
+    memory = f"memory {'' if now.memory_locked else 'not '}locked"
+    return f"{granted}, {memory}, processors {'stay awake' if now.awake else 'may sleep'}"
 
 
 def _target(now: Status) -> str:

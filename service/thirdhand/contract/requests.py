@@ -307,6 +307,7 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     missed: int
     realtime: bool
     memory_locked: bool
+    awake: bool
     skill: str
     hands: Hands = "both"  # hands that the skill follows; `neither`: wishes lead
     via_points: tuple[str, ...]

@@ -97,7 +97,7 @@ class CellState:
         self.core = RehearsedController(settings, skill.for_loop())
         self.clock = Deadlines(settings.rate_hz)
         self.times = TickTimes(settings.rate_hz)
-        self.granted = Granted(realtime=False, memory_locked=False)
+        self.granted = Granted(realtime=False, memory_locked=False, awake=False)
 
         # Before the first tick, the arm is not ready and nobody was seen.
         self.frame: Frame = blank(frame_layout(len(settings.joints.names)))

@@ -20,8 +20,8 @@ from thirdhand.contract.requests import Percentiles
 from thirdhand.core.frame import STAGES, Frame, Record, Vector, timed
 
 SPIN_NS = 100_000  # busy waiting before a deadline, only under real-time scheduling
-# the next tick is prepared within this time; at 430 µs, one tick of 100 was 0.1 to 0.26 ms late
-PREPARING_NS = 560_000
+# the next tick is prepared within this time; at 350 µs, one tick of 100 was 20 to 70 µs late
+PREPARING_NS = 480_000
 PREPARE_NS = 3 * PREPARING_NS // 2  # preparation begins this long before the deadline
 BESIDE_NS = 300_000  # work beside the loop is done in parts, most of which take less
 NO_TICK_S = 0.02  # work beside a loop that does not tick is done after this time
@@ -164,10 +164,12 @@ class Granted(NamedTuple):
 
     realtime: bool  # real-time scheduling of the thread
     memory_locked: bool  # memory pages of the process remain in memory once they are used
+    awake: bool  # idle processors do not sleep, which would empty their caches
 
 
-def ask_for_real_time() -> Granted:
-    """Request real-time scheduling for this thread and locked memory, and return what was granted.
+def ask_for_real_time(*, awake: bool = True) -> Granted:
+    """Request real-time scheduling for this thread and locked memory, and that the processors stay
+    `awake` until this process ends. Returns what was granted.
 
     Existing objects are exempted from garbage collection in any case, and it is enabled.
     """
@@ -175,7 +177,7 @@ def ask_for_real_time() -> Granted:
     gc.freeze()
     gc.enable()
     sys.setswitchinterval(0.0005)
-    return Granted(_scheduled(), _locked())
+    return Granted(_scheduled(), _locked(), awake and _awake())
 
 
 def _scheduled() -> bool:
@@ -191,6 +193,15 @@ def _locked() -> bool:
         return bool(ctypes.CDLL(None).mlockall(_LOCK_TOUCHED_PAGES) == 0)
     except (OSError, AttributeError):
         return False
+
+
+def _awake() -> bool:
+    """Ask for a latency of 0 µs of idle processors, which Linux keeps while the file is open."""
+    try:
+        os.write(os.open("/dev/cpu_dma_latency", os.O_WRONLY), bytes(4))
+    except OSError:
+        return False
+    return True
 
 
 def run_beside_real_time() -> None:

@@ -371,7 +371,7 @@ class RecordingSettings(Section, frozen=True):
 class LoopSettings(Section, frozen=True):
     """The loop's use of the processor."""
 
-    # rehearse each tick before its deadline, which shortens it and takes about a tenth of a core
+    # rehearse each tick before its deadline and keep processors awake, for processor time and power
     prepare: bool = True
 
 
