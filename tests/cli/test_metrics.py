@@ -156,7 +156,6 @@ def test_each_figure_has_its_unit_and_a_silent_cell_is_down() -> None:
         ("ticks_total",): 100,
         ("missed_deadlines_total",): 7,
         ("memory_locked",): 0,
-        ("awake",): 0,
         ("lateness_seconds", ("percentile", "99")): 2e-6,
         ("latency_seconds", ("percentile", "100")): 4e-3,
         ("source_age_seconds", ("source", "left")): 0.02,

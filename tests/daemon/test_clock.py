@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from thirdhand.daemon.clock import (
     STEP_NS,
     Deadlines,
     SystemClock,
+    ask_for_real_time,
 )
 
 PERIOD_NS = 2_000_000
@@ -208,6 +210,22 @@ def test_next_tick_is_prepared_and_the_deadline_kept() -> None:
         decided.append((index, deadlines.stamp_ns))
     assert len(announced) > 380
     assert set(announced) <= set(decided)
+
+
+def test_processors_stay_awake_only_if_wished_and_allowed(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    for name in ("_scheduled", "_locked"):
+        monkeypatch.setattr(clock_module, name, lambda: False)
+    latency = tmp_path / "cpu_dma_latency"
+    monkeypatch.setattr(clock_module, "AWAKE", str(latency))
+    assert not ask_for_real_time().awake
+    assert not caplog.messages
+    assert not ask_for_real_time(awake=True).awake
+    assert f"processors may sleep: {latency}: No such file" in caplog.messages[0]
+    latency.write_bytes(b"")
+    assert ask_for_real_time(awake=True).awake
+    assert latency.read_bytes() == bytes(4)  # a number of 32 bits [µs]
 
 
 def test_work_beside_the_loop_is_done_while_it_sleeps(monkeypatch: pytest.MonkeyPatch) -> None:

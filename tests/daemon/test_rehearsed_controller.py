@@ -56,8 +56,8 @@ def led_by_wishes(skill: Skill) -> Given:
     for index in range(400):
         now_ns = START_NS + PERIOD_NS * index
         ahead_ms = [0, 33, 66, -5000] if index % 50 == 0 else []
-        off = np.array([0.0, 1e-4 * index, 0.0])
-        wishes = [wish(tool + off, skill.orientation, now_ns + 10**6 * ms) for ms in ahead_ms]
+        offset = np.array([0.0, 1e-4 * index, 0.0])
+        wishes = [wish(tool + offset, skill.orientation, now_ns + 10**6 * ms) for ms in ahead_ms]
         ticks.append(Tick(index, tuple(wishes), now_ns))
     return Given(settings, skill, ticks)
 

@@ -8,7 +8,7 @@ from pathlib import Path
 SABOTAGE = """
 import pathlib
 from thirdhand.core import controller
-from thirdhand.daemon import cell_state, daemon, queryables, status
+from thirdhand.daemon import cell_state, queryables, rehearsed_controller, status
 
 def sabotaged(owner, name, folder=pathlib.Path({folder!r})):
     honest = getattr(owner, name)
@@ -22,7 +22,7 @@ def sabotaged(owner, name, folder=pathlib.Path({folder!r})):
 
 sabotaged(status.CellStatus, "status")
 sabotaged(controller.Controller, "step")
-sabotaged(daemon, "outgoing")
+sabotaged(rehearsed_controller, "outgoing")
 sabotaged(queryables.RequestQueue, "enqueue")
 sabotaged(cell_state.CellState, "note")
 """

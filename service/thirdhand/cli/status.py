@@ -182,8 +182,8 @@ def _outcome(now: Status) -> dict[str, str]:
 
 def _scheduling(now: Status) -> str:
     granted = "real time" if now.realtime else "ordinary: real time was not granted"
-    memory = f"memory {'' if now.memory_locked else 'not '}locked"
-    return f"{granted}, {memory}, processors {'stay awake' if now.awake else 'may sleep'}"
+    awake = ", processors stay awake" if now.awake else ""
+    return f"{granted}, memory {'' if now.memory_locked else 'not '}locked{awake}"
 
 
 def _target(now: Status) -> str:

@@ -7,6 +7,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import gc
+import logging
 import os
 import sys
 import threading
@@ -16,9 +17,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from thirdhand.contract.explain import in_words
 from thirdhand.contract.requests import Percentiles
 from thirdhand.core.frame import STAGES, Frame, Record, Vector, timed
 
+log = logging.getLogger("thirdhand")
 SPIN_NS = 100_000  # busy waiting before a deadline, only under real-time scheduling
 # the next tick is prepared within this time; at 350 µs, one tick of 100 was 20 to 70 µs late
 PREPARING_NS = 480_000
@@ -28,6 +31,7 @@ NO_TICK_S = 0.02  # work beside a loop that does not tick is done after this tim
 STEP_NS = 20_000_000  # a larger difference from the system clock shows that the clock was set
 READ_NS = 1_000_000  # two clocks that were read within this time are compared
 DRAW = 256  # [deadlines] time constant with which stamps follow a smaller difference
+AWAKE = "/dev/cpu_dma_latency"  # Linux's file for the latency that idle processors may have [µs]
 CREEP_NS = 1_000  # stamps grow by this per deadline while the system clock is behind
 _LOCK_TOUCHED_PAGES = 1 | 2 | 4  # MCL_CURRENT, MCL_FUTURE and MCL_ONFAULT of Linux
 FIFO_PRIORITY = 80  # priority of the loop
@@ -167,9 +171,9 @@ class Granted(NamedTuple):
     awake: bool  # idle processors do not sleep, which would empty their caches
 
 
-def ask_for_real_time(*, awake: bool = True) -> Granted:
-    """Request real-time scheduling for this thread and locked memory, and that the processors stay
-    `awake` until this process ends. Returns what was granted.
+def ask_for_real_time(*, awake: bool = False) -> Granted:
+    """Request real-time scheduling for this thread and locked memory, and, if so wished, that the
+    processors stay `awake` until this process ends. Returns what was granted.
 
     Existing objects are exempted from garbage collection in any case, and it is enabled.
     """
@@ -196,10 +200,15 @@ def _locked() -> bool:
 
 
 def _awake() -> bool:
-    """Ask for a latency of 0 µs of idle processors, which Linux keeps while the file is open."""
+    """Ask for idle processors without latency, which Linux grants while the file is open."""
     try:
-        os.write(os.open("/dev/cpu_dma_latency", os.O_WRONLY), bytes(4))
-    except OSError:
+        os.write(os.open(AWAKE, os.O_WRONLY), bytes(4))
+    except OSError as error:
+        log.warning(
+            "idle processors may sleep: %s. docs/hardware.md says how to allow it, or set awake = "
+            "false under [loop]",
+            in_words(error),
+        )
         return False
     return True
 
@@ -228,9 +237,8 @@ class Window:
 
     def largest(self, count: int) -> float:
         """The largest of the `count` newest values; 0 while the window is empty."""
-        newest = self._values.take(
-            range(self._count - min(count, self._count), self._count), mode="wrap"
-        )
+        places = np.arange(self._count - min(count, self._count), self._count)
+        newest = self._values.take(places, mode="wrap")
         return float(newest.max(initial=0.0))
 
     def percentiles(self) -> Percentiles:

@@ -90,7 +90,7 @@ class Daemon:
             cell.scribe.start(
                 skill=cell.file, state=cell.controller.state, constants=cell.controller.constants
             )
-            cell.granted = ask_for_real_time(awake=cell.settings.loop.prepare)
+            cell.granted = ask_for_real_time(awake=cell.settings.loop.awake)
             cell.clock = Deadlines(
                 cell.settings.rate_hz, spin_ns=SPIN_NS if cell.granted.realtime else 0
             )

@@ -152,7 +152,6 @@ def _of_loop(now: Status) -> tuple[tuple[str, str, float | None], ...]:
         ("rate_hertz", "Ticks per second since the start.", now.rate_hz),
         ("realtime", "1 if real-time scheduling was granted.", now.realtime),
         ("memory_locked", "1 if memory is not paged out.", now.memory_locked),
-        ("awake", "1 if idle processors do not sleep.", now.awake),
         ("busy", "1 if the machine is too busy, or was when the arm stopped.", bool(now.busy)),
         ("command_heard", "1 if anybody subscribes to joint commands.", now.command_heard),
         (

@@ -131,11 +131,7 @@ def _whole(
         began = service.log.read_text().partition("started in ")[2].partition("\n")[0]
     return heard | {
         "start": began,
-        "granted": {
-            "realtime": status.realtime,
-            "memory_locked": status.memory_locked,
-            "awake": status.awake,
-        },
+        "granted": {"realtime": status.realtime, "memory_locked": status.memory_locked},
         "ticks": int(timing["tick"][-1] - timing["tick"][0]),
         "missed": int(timing["missed"][-1] - timing["missed"][0]),
         **figures(timing["lateness_us"], timing["work_us"]),
@@ -215,8 +211,7 @@ def text(report: dict[str, Any]) -> str:
     granted = report["granted"]
     rows += [
         f"    {'real-time scheduling' if granted['realtime'] else 'ordinary scheduling'}, memory "
-        f"{'locked' if granted['memory_locked'] else 'not locked'}, processors "
-        f"{'stay awake' if granted['awake'] else 'may sleep'}",
+        f"{'locked' if granted['memory_locked'] else 'not locked'}",
         *([f"    started in {whole['start']}"] if whole.get("start") else []),
         "",
         f"  late, 99th and 99.9th percentile: {ratios['lateness_p99']:.2f} and "
