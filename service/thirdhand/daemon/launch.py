@@ -125,7 +125,8 @@ def launched(
         )
     )
     command = python(*program, "serve", "--config", str(config), *_end_with_this(), *arguments)
-    with log.open("w") as errors:
+    log.write_text("")
+    with log.open("a") as errors:  # others may append to it, or cut it
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True)
     with process:
         try:
