@@ -199,17 +199,31 @@ def test_next_tick_is_prepared_and_the_deadline_kept() -> None:
     deadlines.wait(prepare)
     assert len(prepared) == 1
 
-    # the clock drifts by 500 parts in a million, and a deadline is missed now and then
+    # the clock drifts by 500 parts in a million and is set, and deadlines are missed
     clock.oversleep_ns = 0
     announced.clear()
     decided = []
     for k in range(400):
-        clock.set_by_ns += 1_000
+        clock.set_by_ns += 1_000 - 10**9 * (k == 100) + 10**12 * (k == 300)
         clock.now += 2 * PERIOD_NS * (k % 50 == 49)
         index, _ = deadlines.wait(prepare)
         decided.append((index, deadlines.stamp_ns))
     assert len(announced) > 380
     assert set(announced) <= set(decided)
+
+
+def test_deadline_whose_preparation_fails_is_still_to_come() -> None:
+    clock = FakeClock()
+    deadlines = clock.deadlines()
+    before = stamps(clock, deadlines, 5)[-1]
+
+    def fail(index: int, stamp_ns: int) -> None:
+        raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        deadlines.wait(fail)
+    assert deadlines.wait() == (5, 0)
+    assert (deadlines.stamp_ns - before, deadlines.missed) == (PERIOD_NS, 0)
 
 
 def test_processors_stay_awake_only_if_wished_and_allowed(

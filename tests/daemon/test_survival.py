@@ -17,7 +17,7 @@ from typing import Any
 
 import pytest
 
-from support.cell import Daemon, Tracker, is_running, serving, thirdhand, until
+from support.cell import LISTENING, Daemon, Tracker, is_running, serving, thirdhand, until
 from support.paths import ROOT
 from support.sabotage import SABOTAGE, fail
 from thirdhand.client import Client, RefusedError, UnreachableError, open_session
@@ -38,13 +38,15 @@ def until_gone(pids: list[int], within_s: float) -> None:
     until(lambda: not any(map(is_running, pids)), "processes are left", within_s=within_s)
 
 
+def is_at_fault(status: dict[str, Any]) -> bool:
+    return (status["mode"], status["reason"]) == ("fault", "service")
+
+
 def test_failed_part_is_a_fault_and_all_goes_on(tmp_path: Path) -> None:
-    """The fault is reported, and the other parts continue."""
+    """The fault is reported, and the other parts continue. Nothing is rehearsed: a tick whose
+    rehearsal fails is not lost.
+    """
     records = tmp_path / "records"
-
-    def is_at_fault(status: dict[str, Any]) -> bool:
-        return (status["mode"], status["reason"]) == ("fault", "service")
-
     with (
         serving(
             tmp_path,
@@ -53,6 +55,7 @@ def test_failed_part_is_a_fault_and_all_goes_on(tmp_path: Path) -> None:
             "--record",
             str(records),
             before=SABOTAGE.format(folder=str(tmp_path)),
+            network=f"{LISTENING}[loop]\nprepare = false\n",
         ) as daemon,
         Tracker(daemon.session),
     ):
@@ -80,6 +83,22 @@ def test_failed_part_is_a_fault_and_all_goes_on(tmp_path: Path) -> None:
     result = replay(recording)
     assert result.identical == result.ticks > 0, result.text()
     assert [gap.lost for gap in result.missing] == [1, 1]  # the ticks at which the loop failed
+
+
+def test_failure_of_whatever_follows_is_a_fault_too(tmp_path: Path) -> None:
+    """Each rehearsal and each tick fail until the tick that takes in the fault."""
+    sabotage = SABOTAGE.format(folder=str(tmp_path))
+    with (
+        serving(tmp_path, "--joints", "assumed", before=sabotage) as daemon,
+        Tracker(daemon.session),
+    ):
+        daemon.until(lambda status: status["mode"] == "follow")
+        fail(tmp_path, "_follow")
+        daemon.until(is_at_fault)
+        (tmp_path / "_follow").unlink()
+        for request in ("hold", "reset", "resume"):
+            daemon.client.ask(request)
+        daemon.until(lambda status: status["mode"] == "follow")
 
 
 def test_a_loop_that_cannot_go_on_ends_the_daemon_with_words(tmp_path: Path) -> None:

@@ -22,6 +22,7 @@ def sabotaged(owner, name, folder=pathlib.Path({folder!r})):
 
 sabotaged(status.CellStatus, "status")
 sabotaged(controller.Controller, "step")
+sabotaged(controller.Controller, "_follow")
 sabotaged(rehearsed_controller, "outgoing")
 sabotaged(queryables.RequestQueue, "enqueue")
 sabotaged(cell_state.CellState, "note")

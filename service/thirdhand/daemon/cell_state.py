@@ -9,7 +9,6 @@ from collections import deque
 
 from thirdhand.client import endpoints
 from thirdhand.contract.records import Reason
-from thirdhand.core.controller import Controller
 from thirdhand.core.frame import Event, Frame, Record, blank, frame_layout, order
 from thirdhand.core.separation import FARTHEST_REPORTED_M
 from thirdhand.daemon.cell_streams import CellStreams
@@ -95,6 +94,7 @@ class CellState:
         self.endpoints = endpoints(start.session) if settings.network.listen else ()
         start.lock.announce(self.endpoints)
         self.core = RehearsedController(settings, skill.for_loop())
+        self.controller = self.core.controller
         self.clock = Deadlines(settings.rate_hz)
         self.times = TickTimes(settings.rate_hz)
         self.granted = Granted(realtime=False, memory_locked=False, awake=False)
@@ -124,11 +124,6 @@ class CellState:
         self.newest_status = NewestStatus()
         self.failure = ""  # message of the service's last failure
         self._notes = (0, 0)  # time [s] and the number of notes in this second
-
-    @property
-    def controller(self) -> Controller:
-        """The controller in force, which another one may replace at each tick."""
-        return self.core.controller
 
     def moment(self) -> tuple[Frame, Record]:
         """The newest frame, and the state after it."""

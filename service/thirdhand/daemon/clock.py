@@ -45,8 +45,8 @@ class Deadlines:
 
     Missed deadlines are skipped and counted; there is no burst to make up for them. `stamp_ns` is
     the time of the newest deadline on the system clock [ns], and always grows. It advances by whole
-    periods and follows the system clock slowly. If the clock was set ahead, it follows at once; if
-    the clock was set back, it grows by CREEP_NS per deadline until the clock has passed it.
+    periods and follows the system clock slowly. If the clock was set ahead, the next stamp follows;
+    if it was set back, `stamp_ns` grows by CREEP_NS per deadline until the clock has passed it.
     """
 
     def __init__(
@@ -66,7 +66,6 @@ class Deadlines:
         self._sleep = sleep
         self._start_ns = now_ns()
         self.stamp_ns = wall_ns() - self.period_ns
-        self._drift_ns = 0  # how far the system clock was ahead of the newest stamp
         self._index = -1
         self._sleeps_until_ns = 0
         # locked by `between_ticks`, released at the end of a tick
@@ -88,14 +87,14 @@ class Deadlines:
         """Wait for the next deadline and return its number and lateness [ns].
 
         `prepare` is called PREPARE_NS before the deadline with its number and stamp, unless it
-        would end after the deadline. The stamp is another one if the clock is set meanwhile.
+        would end after the deadline. If it raises an exception, the deadline is still to come.
         """
-        index = max(self._index + 1, (self._now_ns() - self._start_ns) // self.period_ns)
+        wall_ns = self._wall_ns()
+        now_ns = self._now_ns()
+        index = max(self._index + 1, (now_ns - self._start_ns) // self.period_ns)
         passed = index - self._index
-        self.missed += passed - 1
-        self._index = index
         deadline = self._start_ns + index * self.period_ns
-        stamp_ns = self.stamp_ns + passed * self.period_ns + self._drift_ns // DRAW
+        stamp_ns = self._stamp_ns(passed, wall_ns + deadline - now_ns)
         self._sleeps_until_ns = deadline - (self._spin_ns if prepare is None else PREPARE_NS)
         if self._is_in_tick.locked():
             self._is_in_tick.release()
@@ -108,14 +107,20 @@ class Deadlines:
         while (late := self._now_ns() - deadline) < 0:
             pass
 
-        drift_ns = self._wall_ns() - late - stamp_ns
-        if drift_ns >= STEP_NS:
-            stamp_ns += drift_ns
-        elif drift_ns <= -STEP_NS:
-            stamp_ns = self.stamp_ns + CREEP_NS
-        self._drift_ns = drift_ns if -STEP_NS < drift_ns < STEP_NS else 0
+        self.missed += passed - 1
+        self._index = index
         self.stamp_ns = stamp_ns
         return index, late
+
+    def _stamp_ns(self, passed: int, wall_ns: int) -> int:
+        """The stamp of a deadline this many periods after the newest one, when the system clock
+        will show `wall_ns`.
+        """
+        due_ns = self.stamp_ns + passed * self.period_ns
+        drift_ns = wall_ns - due_ns
+        if drift_ns >= STEP_NS:
+            return wall_ns
+        return self.stamp_ns + CREEP_NS if drift_ns <= -STEP_NS else due_ns + drift_ns // DRAW
 
     def _sleep_until(self, at_ns: int) -> None:
         """Sleep until a time [ns], unless it has passed."""

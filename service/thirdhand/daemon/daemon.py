@@ -69,6 +69,7 @@ class Daemon:
         """`skills` is the folder from which clients load skills."""
         self._cell = cell
         self._received: list[Event] = []  # the messages for the next tick that came before it
+        self._is_in_tick = False
         self._failed_at: int | None = None  # tick of the loop's last failure
 
         # Threads beside the loop make the status and answer requests.
@@ -132,7 +133,9 @@ class Daemon:
         failure.
         """
         cell = self._cell
-        cell.scribe.skip()
+        if self._is_in_tick:  # else it failed before the deadline, so that no tick is lost
+            cell.scribe.skip()
+            self._is_in_tick = False
         cell.inbox.answer(None)
         self._received = []  # one of them may be the cause
         tick = int(cell.frame["tick"])
@@ -174,6 +177,7 @@ class Daemon:
         cell = self._cell
         for tick in self._ticks():
             self._publish(cell.core.decide(tick, cell.times.lap))
+            self._is_in_tick = False
 
     def _ticks(self) -> Iterator[Tick]:
         """A tick at each deadline, with what arrived until then. After `stop`, each tick orders a
@@ -187,6 +191,7 @@ class Daemon:
         prepare = self._rehearse if has_time and cell.settings.loop.prepare else None
         while True:
             index, late_ns = cell.clock.wait(prepare)
+            self._is_in_tick = True
             cell.times.begin(late_ns)
             if cell.stop.is_set():
                 if stop_by is None:
@@ -212,11 +217,14 @@ class Daemon:
             requests.answer(cell.frame)  # the frame of this tick
 
     def _rehearse(self, index: int, time_ns: int) -> None:
-        """Read the messages that have come for the next tick, and rehearse it with them."""
+        """Read the messages that have come for the next tick, and rehearse it with them and the
+        service's own events.
+        """
         cell = self._cell
         self._received = cell.streams.receive(self._received)
         cell.times.begin(0)
-        cell.core.rehearse(Tick(index, tuple(self._received), time_ns), cell.times.lap)
+        inbox = (*self._received, *cell.own)
+        cell.core.rehearse(Tick(index, inbox, time_ns), cell.times.lap)
 
     def _publish(self, decided: DecidedTick) -> None:
         """Publish and record what a tick decided."""
@@ -227,6 +235,7 @@ class Daemon:
         )
         for key, payload in outputs:
             cell.streams.publish(key, payload, attachment)
+        cell.core.settle()
         cell.frame = frame
         timing = cell.times.end(frame, cell.clock)
         cell.scribe.send(

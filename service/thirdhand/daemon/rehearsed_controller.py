@@ -22,8 +22,8 @@ class RehearsedController:
     """A controller and its twin, on which the next tick is rehearsed.
 
     If the tick takes in the same as the rehearsed one, the twin has its frame and its messages, bit
-    for bit, and the two change places. Else the rehearsal has brought code and data into the
-    processor's caches. All methods are for the loop.
+    for bit. Else the rehearsal has brought code and data into the processor's caches. All methods
+    are for the loop; other threads read `controller`.
     """
 
     def __init__(self, settings: Settings, skill: Skill) -> None:
@@ -32,19 +32,31 @@ class RehearsedController:
         self.controller = Controller(settings, skill, urdf=urdf)
         self._twin = Controller(settings, skill, urdf=urdf)
         self._rehearsed: DecidedTick | None = None
+        self._twin_leads = False  # the newest tick was the rehearsed one
 
     def rehearse(self, tick: Tick, lap: Lap) -> None:
         """Decide what is likely to be the next tick, without consequence for the controller."""
+        self.settle()
+        self._rehearsed = None
         self._twin.copy_from(self.controller)
         self._rehearsed = self._decided(self._twin, tick, lap)
 
     def decide(self, tick: Tick, lap: Lap) -> DecidedTick:
-        """The frame and the messages of a tick, by the rehearsal if it was of an equal one."""
+        """The frame and the messages of a tick, by the rehearsal if it was of an equal one. Call
+        `settle` once they are published.
+        """
+        self.settle()
         rehearsed = self._rehearsed
         if rehearsed is None or rehearsed.tick != tick:
             return self._decided(self.controller, tick, lap)
-        self.controller, self._twin = self._twin, self.controller
+        self._twin_leads = True
         return rehearsed
+
+    def settle(self) -> None:
+        """Have the controller take over what the twin decided. Nothing is done without need."""
+        if self._twin_leads:
+            self.controller.copy_from(self._twin)
+            self._twin_leads = False
 
     def _decided(self, controller: Controller, tick: Tick, lap: Lap) -> DecidedTick:
         frame = controller.step(tick, lap)
