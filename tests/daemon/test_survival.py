@@ -93,9 +93,9 @@ def test_failure_of_whatever_follows_is_a_fault_too(tmp_path: Path) -> None:
         Tracker(daemon.session),
     ):
         daemon.until(lambda status: status["mode"] == "follow")
-        fail(tmp_path, "_follow")
+        fail(tmp_path, "follow")
         daemon.until(is_at_fault)
-        (tmp_path / "_follow").unlink()
+        (tmp_path / "follow").unlink()
         for request in ("hold", "reset", "resume"):
             daemon.client.ask(request)
         daemon.until(lambda status: status["mode"] == "follow")

@@ -8,6 +8,7 @@ from pathlib import Path
 SABOTAGE = """
 import pathlib
 from thirdhand.core import controller
+from thirdhand.core.arm import stage as arm
 from thirdhand.daemon import cell_state, queryables, rehearsed_controller, status
 
 def sabotaged(owner, name, folder=pathlib.Path({folder!r})):
@@ -22,7 +23,7 @@ def sabotaged(owner, name, folder=pathlib.Path({folder!r})):
 
 sabotaged(status.CellStatus, "status")
 sabotaged(controller.Controller, "step")
-sabotaged(controller.Controller, "_follow")
+sabotaged(arm.ArmStage, "follow")
 sabotaged(rehearsed_controller, "outgoing")
 sabotaged(queryables.RequestQueue, "enqueue")
 sabotaged(cell_state.CellState, "note")
