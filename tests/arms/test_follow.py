@@ -23,6 +23,7 @@ from hypothesis import strategies as st
 
 from support.arms import MODELS, toml_of
 from support.cell import LEFT, Tracker, serving, thirdhand, told, until
+from support.driven_arms import NEAR_LEFT, driven
 from support.franka_cell import assert_allowed, franka_toml, robot, simulated
 from support.paths import ROOT
 from thirdhand.arms import place_of
@@ -38,7 +39,6 @@ from thirdhand.daemon.launch import free_port
 from thirdhand.process.own_class import explained, own_class
 from thirdhand.settings.config import Settings
 
-NEAR_LEFT = (0.85, -0.30, 0.10)
 STILL_RADPS = 0.02  # a slower measured joint is at rest
 
 
@@ -300,12 +300,7 @@ def test_an_arm_that_was_led_stays_where_it_was_led_to() -> None:
     """So does one that stands elsewhere for another reason, after a moment."""
     arm = Led(Settings())
     begin = arm.position.copy()
-    stop = threading.Event()
-    with open_session() as session:
-        driver = threading.Thread(
-            target=follow, args=(arm, session, "thirdhand"), kwargs={"stop": stop}
-        )
-        driver.start()
+    with open_session() as session, driven(arm, session):
         until(lambda: hasattr(arm, "written"))
         arm.guided = True
         for step in range(20):
@@ -315,8 +310,6 @@ def test_an_arm_that_was_led_stays_where_it_was_led_to() -> None:
         arm.guided = False
         time.sleep(0.1)
         assert np.abs(arm.position - begin - 0.38).max() < 1e-6
-        stop.set()
-        driver.join(10)
 
 
 def test_an_arm_outside_its_limits_does_not_jump() -> None:

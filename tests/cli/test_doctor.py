@@ -17,7 +17,7 @@ import zenoh
 
 from support.cell import LEFT, Daemon, Tracker, until
 from support.cell_commands import started
-from thirdhand.arms.drive import follow
+from support.driven_arms import driven
 from thirdhand.arms.simulated import SimulatedArm
 from thirdhand.client import endpoints, open_session
 from thirdhand.command_line import main
@@ -41,20 +41,11 @@ OF_THE_MACHINE = {"machine", "loop", "real time", "memory", "disk"}
 
 
 @contextlib.contextmanager
-def driven(endpoint: str) -> Iterator[SimulatedArm]:
+def simulated(endpoint: str) -> Iterator[SimulatedArm]:
     """A simulated arm, driven on a session of its own."""
-    stop = threading.Event()
     arm = SimulatedArm(Settings())
-    with open_session(connect=[endpoint]) as session:
-        driver = threading.Thread(
-            target=follow, args=(arm, session, "thirdhand"), kwargs={"stop": stop}
-        )
-        driver.start()
-        try:
-            yield arm
-        finally:
-            stop.set()
-            driver.join(10)
+    with open_session(connect=[endpoint]) as session, driven(arm, session):
+        yield arm
 
 
 @contextlib.contextmanager
@@ -108,7 +99,7 @@ def test_a_cell_with_ones_own_arm_and_tracker(
             "let it publish under the cell's key, thirdhand/hands/left; or start the tracker"
         )
 
-        with driven(daemon.endpoint) as arm, Tracker(daemon.session) as tracker:
+        with simulated(daemon.endpoint) as arm, Tracker(daemon.session) as tracker:
             daemon.until(lambda status: status["mode"] == "follow")
             # the rate is known some time after the driver's first state
             for _ in range(5):
