@@ -14,18 +14,14 @@ import numpy as np
 import pytest
 
 from support.arms import published
+from support.demo import SCENE, soldered
 from support.paths import ROOT
 from thirdhand.core.arm.stage import ArmStage
 from thirdhand.core.separation.stage import Separation
-from thirdhand.recordings.shipped import shipped_skill
 from thirdhand.settings.config import load, robot_description
 from thirdhand.settings.urdf import Urdf
-from thirdhand.skills.via_points import adapted
 from thirdhand.workbench.first_cell.first_cell import Proposal, proposed, written
 from thirdhand.workbench.first_cell.rates import rates
-from thirdhand_sim.lab.rehearsal import rehearse
-from thirdhand_sim.scene import Scene
-from thirdhand_sim.script import HandScript
 
 SHIPPED = ROOT / "service" / "thirdhand" / "arms"
 SAWYER = Path(__file__).with_name("sawyer.urdf")
@@ -85,10 +81,8 @@ def test_first_cell_meets_the_demos_places(name: str, tmp_path: Path) -> None:
     upper = np.array(cell.joints.upper)
     assert (np.minimum(posture - lower, upper - posture) > 0.05 * (upper - lower)).all()
 
-    scene, moved = Scene().in_reach(cell.reach)
-    assert moved == ()
-    taught = adapted(shipped_skill(), scene.via_points(), tolerance=0.001).for_loop()
-    run = rehearse(HandScript(scene, seed=1), lambda _: taught, settings=cell, rate_hz=100)
+    assert SCENE.in_reach(cell.reach) == (SCENE, ())
+    run = soldered(cell)
     assert run.events.success
     assert max(run.errors_mm) < 15.0, run.errors_mm
 

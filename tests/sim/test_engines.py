@@ -8,17 +8,13 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
+from support.demo import SCENE, soldered
 from thirdhand.daemon.launch import ENGINES, LaunchError, engine_of
-from thirdhand.recordings.shipped import shipped_skill
-from thirdhand.skills.via_points import adapted
 from thirdhand_sim.bench import Bench
 from thirdhand_sim.engines import world_of
-from thirdhand_sim.lab.rehearsal import Rehearsed, rehearse
-from thirdhand_sim.scene import Scene
 from thirdhand_sim.script import HandScript
 from thirdhand_sim.world import LEVEL, Pose, pixels
 
-SCENE = Scene()
 EYE = (1.66, -0.78, 0.80)
 TARGET = (0.53, -0.02, 0.31)
 SIZE = (160, 120)
@@ -37,18 +33,11 @@ def bench(engine: str) -> Iterator[Bench]:
         yield built
 
 
-def played(engine: str) -> Rehearsed:
-    taught = adapted(shipped_skill(), SCENE.via_points(), tolerance=0.001).for_loop()
-    return rehearse(
-        HandScript(SCENE, seed=1), lambda _: taught, world=world_of(engine), rate_hz=100, keep=True
-    )
-
-
 def test_engines_give_same_scores() -> None:
     """The arm's paths agree too."""
     if missing := [name for name in ENGINES if importlib.util.find_spec(name) is None]:
         pytest.skip(f"{ENGINES[missing[0]]} is not installed")
-    result, other = (played(name) for name in ENGINES)
+    result, other = (soldered(world=world_of(name)) for name in ENGINES)
     assert result.events.success
     assert other.events.success
     assert max(*result.errors_mm, *other.errors_mm) < 3.0
