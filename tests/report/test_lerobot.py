@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import json
 import subprocess
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -22,20 +24,34 @@ from thirdhand.core.controller import Controller, run
 from thirdhand.core.frame import Frame, Tick
 from thirdhand.recordings.recording import Recorder, Recording
 from thirdhand.recordings.replay import ticks
+from thirdhand.recordings.steps import Step
 from thirdhand.skills.skill_file import StoredSkill
 
 FIRST = "chunk-000/file-000.parquet"
 LOST = range(3000, 3100)
+Steps = Iterator[tuple[Tick, Step]]
+
+
+@contextlib.contextmanager
+def copied(golden: Path, path: Path, count: int) -> Iterator[tuple[Recorder, Steps]]:
+    """A new recording at this path, and the first ticks of the golden session for it."""
+    old = Recording.open(golden)
+    start, *steps = old.steps()
+    with Recorder(path, settings=old.settings, skill=old.skill, state=start.state) as recorder:
+        yield recorder, itertools.islice(zip(ticks(old), steps, strict=True), count)
+
+
+def converted(folder: Path, *arguments: str | Path) -> int:
+    """The exit code of the command that writes a data set into a folder."""
+    return main(["report", *map(str, arguments), "--lerobot", str(folder)])
 
 
 @pytest.fixture(scope="module")
 def gapped(golden: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Ten seconds of the golden session without 0.2 s of them."""
     path = tmp_path_factory.mktemp("gapped") / "gapped.mcap"
-    old = Recording.open(golden)
-    start, *steps = old.steps()
-    with Recorder(path, settings=old.settings, skill=old.skill, state=start.state) as recorder:
-        for tick, step in itertools.islice(zip(ticks(old), steps, strict=True), 5000):
+    with copied(golden, path, 5000) as (recorder, steps):
+        for tick, step in steps:
             if tick.index not in LOST:
                 lost = len(LOST) * (tick.index == LOST.stop)
                 recorder.write(tick, step.frame, time_ns=step.time_ns, lost=lost)
@@ -45,13 +61,8 @@ def gapped(golden: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def data_set(gapped: Path, golden: Path) -> Path:
     folder = gapped.parent / "data"
-    files = [str(gapped), str(golden)]
-    assert (
-        main(
-            ["report", *files, "--lerobot", str(folder), "--fps", "30", "--task", "Hold the board."]
-        )
-        == 0
-    )
+    options = ("--fps", "30", "--task", "Hold the board.")
+    assert converted(folder, gapped, golden, *options) == 0
     return folder
 
 
@@ -90,7 +101,7 @@ def test_a_closure_that_never_changes_is_left_out(
     closing = recorded(tmp_path / "closing.mcap", skill, resting(0, 600), closing_at=300)
     for files, left_out in (([still], True), ([still, closing], False)):
         folder = tmp_path / f"{len(files)}"
-        assert main(["report", *map(str, files), "--lerobot", str(folder)]) == 0
+        assert converted(folder, *files) == 0
         printed = " ".join(capsys.readouterr().out.split())
         is_said = "rows, without action.gripper, which is always -1" in printed
         columns = parquet.read_table(folder / "data" / FIRST).column_names
@@ -169,10 +180,8 @@ def filmed(golden: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """
     pytest.importorskip("av", reason="videos need the extra `video`")
     path = tmp_path_factory.mktemp("filmed") / "filmed.mcap"
-    old = Recording.open(golden)
-    start, *steps = old.steps()
-    with Recorder(path, settings=old.settings, skill=old.skill, state=start.state) as recorder:
-        for tick, step in itertools.islice(zip(ticks(old), steps, strict=True), 3000):
+    with copied(golden, path, 3000) as (recorder, steps):
+        for tick, step in steps:
             time_ns = step.time_ns + 3_600_000_000_000 * (tick.index >= 1500)
             recorder.write(tick, step.frame, time_ns=time_ns)
             if tick.index % 50 == 0:
@@ -180,21 +189,9 @@ def filmed(golden: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
                     CompressedImage(time_ns, "lens", "jpeg", grey(tick.index // 20))
                 )
                 recorder.image("camera/front", image, time_ns)
-    assert (
-        main(
-            [
-                "report",
-                str(path),
-                str(path),
-                "--lerobot",
-                str(path.parent / "data"),
-                "--task",
-                "Hold.",
-            ]
-        )
-        == 0
-    )
-    return path.parent / "data"
+    folder = path.parent / "data"
+    assert converted(folder, path, path, "--task", "Hold.") == 0
+    return folder
 
 
 def test_a_camera_is_a_video_with_a_picture_for_each_row(filmed: Path) -> None:
@@ -295,14 +292,14 @@ def test_full_disk_leaves_nothing_behind(
     """The next attempt succeeds."""
     path = recorded(tmp_path / "a.mcap", skill, resting(0, 100))
     with small_disk(tmp_path / "disk", "24k") as disk:
-        assert main(["report", str(path), "--lerobot", str(disk / "data")]) == 1
+        assert converted(disk / "data", path) == 1
         assert (
             f"{disk}/data: No space left on device; room on that disk needed"
             in capsys.readouterr().err
         )
         assert list(disk.iterdir()) == []
         subprocess.run(["mount", "-o", "remount,size=4m", disk], check=True)
-        assert main(["report", str(path), "--lerobot", str(disk / "data")]) == 0
+        assert converted(disk / "data", path) == 0
 
 
 def test_there_are_no_data_sets_of_two_arms_or_of_nothing(
@@ -317,7 +314,7 @@ def test_there_are_no_data_sets_of_two_arms_or_of_nothing(
         ([followed, of_another], "one arm is needed"),
         ([alone], "nothing was commanded after both hands had been seen"),
     ):
-        assert main(["report", *map(str, files), "--lerobot", str(tmp_path / "data")]) == 1
+        assert converted(tmp_path / "data", *files) == 1
         assert why in capsys.readouterr().err
         assert not (tmp_path / "data").exists()
 
