@@ -166,11 +166,12 @@ def test_foreign_port_is_distinguished_from_a_closed_one(
     assert "opens no Zenoh session" in capsys.readouterr().out
 
 
-def test_a_cell_of_another_name_is_pointed_out(capsys: pytest.CaptureFixture[str]) -> None:
-    with open_session(listen=["tcp/127.0.0.1:0"]) as near:
-        token = near.liveliness().declare_token("lab/bench2/daemon/1")
-        assert main(["doctor", "--connect", endpoints(near)[0], "--cell", "lab"]) == 1
-        token.undeclare()  # type: ignore[no-untyped-call]
+def test_a_cell_of_another_name_is_pointed_out(
+    listener: zenoh.Session, capsys: pytest.CaptureFixture[str]
+) -> None:
+    token = listener.liveliness().declare_token("lab/bench2/daemon/1")
+    assert main(["doctor", "--connect", endpoints(listener)[0], "--cell", "lab"]) == 1
+    token.undeclare()  # type: ignore[no-untyped-call]
     output = capsys.readouterr().out
     assert (
         "nobody answers on lab/status: only daemons of other cells run there: lab/bench2" in output
@@ -178,16 +179,17 @@ def test_a_cell_of_another_name_is_pointed_out(capsys: pytest.CaptureFixture[str
     assert "give the name of the cell by --cell" in output
 
 
-def test_silent_daemon_is_distinguished_from_none(capsys: pytest.CaptureFixture[str]) -> None:
+def test_silent_daemon_is_distinguished_from_none(
+    listener: zenoh.Session, capsys: pytest.CaptureFixture[str]
+) -> None:
     """A daemon that runs but does not answer is distinguished from none."""
-    with open_session(listen=["tcp/127.0.0.1:0"]) as near:
-        token = occupy(near, "lab")
-        reach = ["--connect", endpoints(near)[0], "--cell", "lab"]
-        assert main(["doctor", *reach]) == 1
-        doctor = capsys.readouterr().out
-        assert main(["status", *reach]) == 1
-        status = capsys.readouterr().err
-        token.undeclare()  # type: ignore[no-untyped-call]
+    token = occupy(listener, "lab")
+    reach = ["--connect", endpoints(listener)[0], "--cell", "lab"]
+    assert main(["doctor", *reach]) == 1
+    doctor = capsys.readouterr().out
+    assert main(["status", *reach]) == 1
+    status = capsys.readouterr().err
+    token.undeclare()  # type: ignore[no-untyped-call]
     for output in (doctor, status):
         assert "its daemon is alive, but it is starting or ending" in output
         assert "start `thirdhand serve`" not in output
