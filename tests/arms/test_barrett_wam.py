@@ -15,14 +15,14 @@ import pytest
 
 from support.cell import LEFT, Tracker, serving
 from support.driven_arms import NEAR_LEFT, driven
-from support.paths import ROOT
+from support.paths import ARMS, ROOT
 from thirdhand.arms import DriveError
 from thirdhand.arms.barrett_wam import BarrettWAM
 from thirdhand.client import open_session
 from thirdhand.daemon.launch import free_port
 from thirdhand.settings.config import Settings
 
-SOURCE = ROOT / "service" / "thirdhand" / "arms" / "wam" / "thirdhand_wam.cpp"
+SOURCE = ARMS / "wam" / "thirdhand_wam.cpp"
 BRAKE_RADPS2 = 6.0  # as the program has it
 pytestmark = pytest.mark.skipif(not shutil.which("g++"), reason="no C++ compiler is installed")
 

@@ -2,43 +2,29 @@
 
 from __future__ import annotations
 
-import contextlib
 import itertools
 import json
 import subprocess
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 from pyarrow import parquet
 
-from support.in_process import ASSUMED, resting
+from support.in_process import record, resting
 from support.pictures import grey
+from support.recorded import copied
 from support.small_disk import small_disk
 from support.wam import JOINT_NAMES, URDF
 from thirdhand.command_line import main
 from thirdhand.contract import cdr
 from thirdhand.contract.images import CompressedImage, encode_image
-from thirdhand.core.controller import Controller, run
 from thirdhand.core.frame import Frame, Tick
-from thirdhand.recordings.recording import Recorder, Recording
-from thirdhand.recordings.replay import ticks
-from thirdhand.recordings.steps import Step
+from thirdhand.recordings.recording import Recording
 from thirdhand.skills.skill_file import StoredSkill
 
 FIRST = "chunk-000/file-000.parquet"
 LOST = range(3000, 3100)
-Steps = Iterator[tuple[Tick, Step]]
-
-
-@contextlib.contextmanager
-def copied(golden: Path, path: Path, count: int) -> Iterator[tuple[Recorder, Steps]]:
-    """A new recording at this path, and the first ticks of the golden session for it."""
-    old = Recording.open(golden)
-    start, *steps = old.steps()
-    with Recorder(path, settings=old.settings, skill=old.skill, state=start.state) as recorder:
-        yield recorder, itertools.islice(zip(ticks(old), steps, strict=True), count)
 
 
 def converted(folder: Path, *arguments: str | Path) -> int:
@@ -50,8 +36,8 @@ def converted(folder: Path, *arguments: str | Path) -> int:
 def gapped(golden: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Ten seconds of the golden session without 0.2 s of them."""
     path = tmp_path_factory.mktemp("gapped") / "gapped.mcap"
-    with copied(golden, path, 5000) as (recorder, steps):
-        for tick, step in steps:
+    with copied(Recording.open(golden), path) as (recorder, steps):
+        for tick, step in itertools.islice(steps, 5000):
             if tick.index not in LOST:
                 lost = len(LOST) * (tick.index == LOST.stop)
                 recorder.write(tick, step.frame, time_ns=step.time_ns, lost=lost)
@@ -97,8 +83,13 @@ def test_a_closure_that_never_changes_is_left_out(
     skill: StoredSkill, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A changing one is kept, also in the episodes where it is constant."""
-    still = recorded(tmp_path / "still.mcap", skill, resting(0, 600))
-    closing = recorded(tmp_path / "closing.mcap", skill, resting(0, 600), closing_at=300)
+
+    def close(frame: Frame) -> None:
+        if frame["tick"] >= 300:
+            frame["closure"] = 1.0
+
+    still = record(tmp_path / "still.mcap", skill, resting(0, 600))
+    closing = record(tmp_path / "closing.mcap", skill, resting(0, 600), change=close)
     for files, left_out in (([still], True), ([still, closing], False)):
         folder = tmp_path / f"{len(files)}"
         assert converted(folder, *files) == 0
@@ -180,8 +171,8 @@ def filmed(golden: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """
     pytest.importorskip("av", reason="videos need the extra `video`")
     path = tmp_path_factory.mktemp("filmed") / "filmed.mcap"
-    with copied(golden, path, 3000) as (recorder, steps):
-        for tick, step in steps:
+    with copied(Recording.open(golden), path) as (recorder, steps):
+        for tick, step in itertools.islice(steps, 3000):
             time_ns = step.time_ns + 3_600_000_000_000 * (tick.index >= 1500)
             recorder.write(tick, step.frame, time_ns=time_ns)
             if tick.index % 50 == 0:
@@ -260,37 +251,11 @@ def test_lerobot_itself_loads_it(data_set: Path) -> None:
         assert loaded[i]["observation.state"].tolist() == rows["observation.state"][i].as_py()
 
 
-def recorded(
-    path: Path,
-    skill: StoredSkill,
-    inputs: list[Tick],
-    urdf: str = URDF,
-    *,
-    closing_at: int | None = None,
-) -> Path:
-    """A recording of an arm that does not report its joints; from the tick `closing_at` on, with a
-    gripper that is to be closed.
-    """
-    controller = Controller(ASSUMED, skill, urdf=URDF)
-    with Recorder(
-        path, settings=ASSUMED, skill=skill.file, state=controller.state, urdf=urdf
-    ) as recorder:
-
-        def keep(tick: Tick, frame: Frame) -> None:
-            if closing_at is not None and tick.index >= closing_at:
-                frame = frame.copy()
-                frame["closure"] = 1.0
-            recorder.write(tick, frame, time_ns=tick.index * 2_000_000)
-
-        run(controller, inputs, [keep])
-    return path
-
-
 def test_full_disk_leaves_nothing_behind(
     skill: StoredSkill, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The next attempt succeeds."""
-    path = recorded(tmp_path / "a.mcap", skill, resting(0, 100))
+    path = record(tmp_path / "a.mcap", skill, resting(0, 100))
     with small_disk(tmp_path / "disk", "24k") as disk:
         assert converted(disk / "data", path) == 1
         assert (
@@ -305,11 +270,10 @@ def test_full_disk_leaves_nothing_behind(
 def test_there_are_no_data_sets_of_two_arms_or_of_nothing(
     skill: StoredSkill, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    followed = recorded(tmp_path / "a.mcap", skill, resting(0, 100))
-    of_another = recorded(
-        tmp_path / "b.mcap", skill, resting(0, 100), URDF.replace('"wam"', '"puma"', 1)
-    )
-    alone = recorded(tmp_path / "c.mcap", skill, [Tick(k) for k in range(100)])
+    followed = record(tmp_path / "a.mcap", skill, resting(0, 100))
+    puma = URDF.replace('"wam"', '"puma"', 1)
+    of_another = record(tmp_path / "b.mcap", skill, resting(0, 100), urdf=puma)
+    alone = record(tmp_path / "c.mcap", skill, [Tick(k) for k in range(100)])
     for files, why in (
         ([followed, of_another], "one arm is needed"),
         ([alone], "nothing was commanded after both hands had been seen"),

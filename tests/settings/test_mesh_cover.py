@@ -17,7 +17,7 @@ from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from support.paths import ROOT
+from support.paths import ARMS
 from thirdhand.core.geometry import rotation
 from thirdhand.core.separation.body import body_of
 from thirdhand.settings.arm_description import description
@@ -26,7 +26,7 @@ from thirdhand.settings.file_content import SettingsError
 from thirdhand.settings.mesh_cover import capsule_around, covered
 from thirdhand.settings.urdf import Shape, Urdf, UrdfError
 
-WAM = (ROOT / "service" / "thirdhand" / "arms" / "wam.urdf").read_text(encoding="utf-8")
+WAM = (ARMS / "wam.urdf").read_text(encoding="utf-8")
 Points = NDArray[np.float64]
 
 

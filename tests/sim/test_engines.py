@@ -12,6 +12,7 @@ from support.demo import SCENE, soldered
 from thirdhand.daemon.launch import ENGINES, LaunchError, engine_of
 from thirdhand_sim.bench import Bench
 from thirdhand_sim.engines import world_of
+from thirdhand_sim.scene import Point
 from thirdhand_sim.script import HandScript
 from thirdhand_sim.world import LEVEL, Pose, pixels
 
@@ -112,14 +113,18 @@ def test_pictures_show_what_is_there(bench: Bench) -> None:
         colours, matrix = bench.world.picture(eye=EYE, target=TARGET, size=SIZE)
     except (ImportError, RuntimeError) as error:
         pytest.skip(f"pictures of this engine need GL: {error}")
-    (across, down), *_ = pixels(np.array([np.add(SCENE.solder, (0, 0, 0.015))]), matrix, SIZE)
     assert colours.shape == (120, 160, 3)
     assert (colours[0, 0] == 255).all()  # the sky
-    red, _, blue = colours[round(down), round(across)].astype(int)
-    assert abs(red - blue) < 40  # grey: it stands on wood
-    (across, down), *_ = pixels(np.array([(1.0, -0.1, 0.0)]), matrix, SIZE)
-    red, _, blue = colours[round(down), round(across)].astype(int)
-    assert red - blue > 40
+
+    def redness(point: Point) -> int:
+        """The red of a point in the picture, less its blue."""
+        (across, down), *_ = pixels(np.array([point]), matrix, SIZE)
+        red, _, blue = colours[round(down), round(across)].astype(int)
+        return int(red - blue)
+
+    x, y, z = SCENE.solder
+    assert abs(redness((x, y, z + 0.015))) < 40  # grey: it stands on wood
+    assert redness((1.0, -0.1, 0.0)) > 40
 
 
 def test_missing_engine_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 import zenoh
 
 from support.cell import LEFT, LISTENING, Tracker, serving
-from support.paths import ROOT
+from support.paths import ARMS, ROOT
 from thirdhand.arms.arm import Arm
 from thirdhand.arms.drive import follow
 from thirdhand.client import open_session
@@ -100,7 +100,7 @@ def status_after_moves(
     times, or at a fault.
     """
     config = folder / "arm.toml"
-    shipped = (ROOT / "service" / "thirdhand" / "arms" / "ur5.toml").read_text()
+    shipped = (ARMS / "ur5.toml").read_text()
     # a busy machine makes any arm late
     urdf = f"urdf = {json.dumps(UR5.arm.urdf)}\nsilent_ms = 1000\n"
     urdf += f"fault_error_rad = {fault_error_rad}"

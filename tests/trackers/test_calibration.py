@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from support.cell import LISTENING, Tracker, serving, told
 from support.cell_commands import assert_refused, started, succeeded
-from support.paths import ROOT
+from support.paths import ARMS, ROOT
 from thirdhand.contract import cdr
 from thirdhand.contract.messages import JointState, PoseStamped
 from thirdhand.daemon.launch import free_port
@@ -647,12 +647,8 @@ def test_a_recording_calibrates_and_checks_a_cell(tmp_path: Path) -> None:
     settings = cell_of("ur5")
     arm = path_of("ur5", 0)
     recording(tmp_path / "led.mcap", held_by("mocap", arm="ur5"), arm.joints, settings)
-    urdf = ROOT / "service" / "thirdhand" / "arms" / "ur5.urdf"
-    text = (
-        (ROOT / "service" / "thirdhand" / "arms" / "ur5.toml")
-        .read_text()
-        .replace('"ur5.urdf"', f'"{urdf}"')
-    )
+    urdf = ARMS / "ur5.urdf"
+    text = (ARMS / "ur5.toml").read_text().replace('"ur5.urdf"', f'"{urdf}"')
     (tmp_path / "cell.toml").write_text(text)
     file = [
         "calibrate",

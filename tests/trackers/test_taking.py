@@ -53,13 +53,10 @@ NOTHING = {"until": "key", "rest_s": 1.0, "is_ended": lambda: False, "longest_s"
 
 
 @pytest.fixture(scope="module")
-def sessions() -> Iterator[tuple[zenoh.Session, zenoh.Session]]:
+def sessions(listener: zenoh.Session) -> Iterator[tuple[zenoh.Session, zenoh.Session]]:
     """A session that receives, and a connected session that publishes."""
-    with (
-        open_session(listen=["tcp/127.0.0.1:0"]) as hearing,
-        open_session(connect=endpoints(hearing)) as sender,
-    ):
-        yield hearing, sender
+    with open_session(connect=endpoints(listener)) as sender:
+        yield listener, sender
 
 
 def encoded(stamp_ns: int, frame: str, *position: float) -> bytes:
