@@ -245,7 +245,6 @@ def test_rate_without_room_to_brake_is_refused(program: str, tmp_path: Path) -> 
     [
         ("class A: pass", "is no class of thirdhand.Arm"),
         ("import nothing_like_this", "ModuleNotFoundError: No module named 'nothing_like_this'"),
-        ("x = 1 + ''", "TypeError: unsupported operand"),
         ("from dataclasses import dataclass\n@dataclass\nclass A:\n  x: int", "is no class of"),
         ("class B: pass", "has no attribute 'A'"),
         ("read: return [0.0], [0.0]", "A.read gives 1 positions and 1 velocities; positions and"),
@@ -253,7 +252,6 @@ def test_rate_without_room_to_brake_is_refused(program: str, tmp_path: Path) -> 
         ("read: return [0.0] * 7, None", "gives 7 positions and velocities of shape (); positions"),
         ("read: return [0.0, 0.0, 0.0]", "gives [0.0, 0.0, 0.0]; positions and velocities needed"),
         ("read: return 2 * ([math.nan] * 7,)", "A.read gives a joint that is not finite"),
-        ("read: return 1 / 0", "A.read: mine.py:3: ZeroDivisionError: division by zero"),
         ("read: assert helper()", "A.read: mine.py:5: ZeroDivisionError: division by zero"),
         ("wait: return None", "A.wait gives None; the time [s] since it was called last needed"),
         ("speak: pass", "mine.py:A has no read, write, which a class of thirdhand.Arm needs"),

@@ -289,12 +289,15 @@ def test_cdr2_is_read_in_both_byte_orders_with_any_options(numbers: bytes) -> No
 
 
 @pytest.mark.parametrize(
-    "codec", [channels.POSE, channels.JOINTS, channels.TRANSFORMS, channels.OBJECTS]
+    ("codec", "data"),
+    [
+        (channels.POSE, POSE),
+        (channels.JOINTS, JOINTS),
+        (channels.TRANSFORMS, TRANSFORMS),
+        (channels.OBJECTS, OBJECTS),
+    ],
 )
-def test_messages_of_a_big_endian_machine_are_read(codec: channels.Codec) -> None:
-    data = {channels.POSE: POSE, channels.JOINTS: JOINTS, channels.TRANSFORMS: TRANSFORMS}.get(
-        codec
-    ) or OBJECTS
+def test_messages_of_a_big_endian_machine_are_read(codec: channels.Codec, data: bytes) -> None:
     store = get_typestore(Stores.ROS2_JAZZY)  # its MarkerArray equals the service's
     big = store.serialize_cdr(
         store.deserialize_cdr(data, codec.type), codec.type, little_endian=False
