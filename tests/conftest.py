@@ -10,12 +10,15 @@ import signal
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import zenoh
 
 from support import forked, tiers
 from support.paths import RECORDINGS, ROOT
+from thirdhand.client import open_session
 from thirdhand.core.skill.skill import Skill
 from thirdhand.process.child import python
 from thirdhand.recordings.replay import replay
@@ -133,6 +136,13 @@ def skill() -> Skill:
     """The shipped soldering skill, without via-points."""
     path = RECORDINGS / "soldering.npz"
     return decoded(path.read_bytes(), origin=str(path))
+
+
+@pytest.fixture(scope="module")
+def listener() -> Iterator[zenoh.Session]:
+    """A session that listens in the daemon's place, at a port that the system chose."""
+    with open_session(listen=["tcp/127.0.0.1:0"]) as session:
+        yield session
 
 
 @pytest.fixture(scope="session")

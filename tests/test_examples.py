@@ -2,29 +2,15 @@
 
 from __future__ import annotations
 
-import importlib.util
 import time
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
 
 import thirdhand
 from support.cell import serving
-from support.paths import ROOT
-
-EXAMPLES = ROOT / "examples"
-
-
-def example(name: str) -> ModuleType:
-    """The module of an example."""
-    spec = importlib.util.spec_from_file_location(f"example_{name}", EXAMPLES / f"{name}.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+from support.examples import example
 
 
 @pytest.mark.thorough

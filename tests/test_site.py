@@ -4,7 +4,6 @@ pages agree with the code.
 
 from __future__ import annotations
 
-import importlib.util
 import re
 import subprocess
 import sys
@@ -18,6 +17,7 @@ import numpy as np
 import pytest
 
 import kmp
+from support import examples
 from support.paths import ROOT
 from thirdhand import client
 from thirdhand.command_line import GROUPS
@@ -85,12 +85,7 @@ INSIDE = {
 
 def program(name: str) -> ModuleType:
     """A program of the documentation."""
-    spec = importlib.util.spec_from_file_location(name, DOCS / f"{name}.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return examples.program(DOCS / f"{name}.py")
 
 
 def written_by(name: str) -> str:

@@ -4,10 +4,8 @@ refuses what would jump, brakes when nothing comes, and a cell moves it.
 
 from __future__ import annotations
 
-import contextlib
 import shutil
 import subprocess
-import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,16 +14,15 @@ import numpy as np
 import pytest
 
 from support.cell import LEFT, Tracker, serving
-from support.paths import ROOT
+from support.driven_arms import NEAR_LEFT, driven
+from support.paths import ARMS, ROOT
 from thirdhand.arms import DriveError
 from thirdhand.arms.barrett_wam import BarrettWAM
-from thirdhand.arms.drive import follow
 from thirdhand.client import open_session
 from thirdhand.daemon.launch import free_port
 from thirdhand.settings.config import Settings
 
-SOURCE = ROOT / "service" / "thirdhand" / "arms" / "wam" / "thirdhand_wam.cpp"
-NEAR_LEFT = (0.85, -0.30, 0.10)
+SOURCE = ARMS / "wam" / "thirdhand_wam.cpp"
 BRAKE_RADPS2 = 6.0  # as the program has it
 pytestmark = pytest.mark.skipif(not shutil.which("g++"), reason="no C++ compiler is installed")
 
@@ -94,7 +91,6 @@ def test_what_would_jump_is_refused(far_rad: float, address: str) -> None:
 
 @pytest.mark.thorough
 def test_a_cell_moves_it(address: str, tmp_path: Path) -> None:
-    stop = threading.Event()
     with (
         serving(tmp_path) as daemon,
         Tracker(daemon.session) as tracker,
@@ -102,13 +98,7 @@ def test_a_cell_moves_it(address: str, tmp_path: Path) -> None:
     ):
         arm = BarrettWAM(Settings(), address)
         begin = arm.read()[0]
-        driver = threading.Thread(
-            target=follow, args=(arm, session, "thirdhand"), kwargs={"stop": stop}
-        )
-        driver.start()
-        with contextlib.ExitStack() as ending:
-            ending.callback(driver.join, 20)
-            ending.callback(stop.set)
+        with driven(arm, session):
             daemon.until(lambda status: status["mode"] == "follow", 30.0)
             for number in range(20):
                 tracker.left = LEFT if number % 2 else NEAR_LEFT

@@ -14,20 +14,15 @@ import numpy as np
 import pytest
 
 from support.arms import published
-from support.paths import ROOT
+from support.demo import SCENE, soldered
+from support.paths import ARMS
 from thirdhand.core.arm.stage import ArmStage
 from thirdhand.core.separation.stage import Separation
-from thirdhand.recordings.shipped import shipped_skill
 from thirdhand.settings.config import load, robot_description
 from thirdhand.settings.urdf import Urdf
-from thirdhand.skills.via_points import adapted
 from thirdhand.workbench.first_cell.first_cell import Proposal, proposed, written
 from thirdhand.workbench.first_cell.rates import rates
-from thirdhand_sim.lab.rehearsal import rehearse
-from thirdhand_sim.scene import Scene
-from thirdhand_sim.script import HandScript
 
-SHIPPED = ROOT / "service" / "thirdhand" / "arms"
 SAWYER = Path(__file__).with_name("sawyer.urdf")
 
 
@@ -38,7 +33,7 @@ def iiwa() -> Path:
     return Path(spec.origin).with_name("kuka_iiwa") / "model.urdf"
 
 
-ARMS: dict[str, tuple[Callable[[], Path], str]] = {
+MODELS: dict[str, tuple[Callable[[], Path], str]] = {
     "iiwa": (iiwa, "lbr_iiwa_link_7"),
     "xarm7": (lambda: published("xarm7.urdf"), "link_eef"),
     "sawyer": (lambda: SAWYER, "right_hand"),
@@ -47,7 +42,7 @@ ARMS: dict[str, tuple[Callable[[], Path], str]] = {
     "ur10": (lambda: published("ur10_robot.urdf"), "tool0"),
     "kinova": (lambda: published("kinova.urdf"), "j2s6s200_end_effector"),
     "panda": (lambda: published("panda.urdf"), "panda_hand_tcp"),
-    "wam": (lambda: SHIPPED / "wam.urdf", "tool_plate"),
+    "wam": (lambda: ARMS / "wam.urdf", "tool_plate"),
 }
 
 
@@ -60,11 +55,11 @@ def in_folder(proposal: Proposal, path: Path, folder: Path) -> Path:
     return folder / "cell.toml"
 
 
-@pytest.mark.parametrize("name", ARMS)
+@pytest.mark.parametrize("name", MODELS)
 @pytest.mark.one_case
 def test_first_cell_meets_the_demos_places(name: str, tmp_path: Path) -> None:
     """The arm meets the demo's via-points, and its posture is over the table."""
-    where, plate = ARMS[name]
+    where, plate = MODELS[name]
     path = where()
     proposal = proposed(path, plate=plate)
     cell = load(in_folder(proposal, path, tmp_path))
@@ -85,10 +80,8 @@ def test_first_cell_meets_the_demos_places(name: str, tmp_path: Path) -> None:
     upper = np.array(cell.joints.upper)
     assert (np.minimum(posture - lower, upper - posture) > 0.05 * (upper - lower)).all()
 
-    scene, moved = Scene().in_reach(cell.reach)
-    assert moved == ()
-    taught = adapted(shipped_skill(), scene.via_points(), tolerance=0.001).for_loop()
-    run = rehearse(HandScript(scene, seed=1), lambda _: taught, settings=cell, rate_hz=100)
+    assert SCENE.in_reach(cell.reach) == (SCENE, ())
+    run = soldered(cell)
     assert run.events.success
     assert max(run.errors_mm) < 15.0, run.errors_mm
 
@@ -97,7 +90,7 @@ def test_accelerations_follow_from_velocities_and_efforts(
     capfd: pytest.CaptureFixture[str],
 ) -> None:
     """Accelerations follow from velocities, and are lower where efforts are small."""
-    text = (SHIPPED / "ur5.urdf").read_text()
+    text = (ARMS / "ur5.urdf").read_text()
     moving = Urdf(text).movable("tool0")
     acceleration, jerk, by_effort = rates(text, moving)
     velocity = np.array([joint.velocity for joint in moving])

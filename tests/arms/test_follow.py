@@ -23,6 +23,7 @@ from hypothesis import strategies as st
 
 from support.arms import MODELS, toml_of
 from support.cell import LEFT, Tracker, serving, thirdhand, told, until
+from support.driven_arms import NEAR_LEFT, driven
 from support.franka_cell import assert_allowed, franka_toml, robot, simulated
 from support.paths import ROOT
 from thirdhand.arms import place_of
@@ -38,7 +39,6 @@ from thirdhand.daemon.launch import free_port
 from thirdhand.process.own_class import explained, own_class
 from thirdhand.settings.config import Settings
 
-NEAR_LEFT = (0.85, -0.30, 0.10)
 STILL_RADPS = 0.02  # a slower measured joint is at rest
 
 
@@ -245,7 +245,6 @@ def test_rate_without_room_to_brake_is_refused(program: str, tmp_path: Path) -> 
     [
         ("class A: pass", "is no class of thirdhand.Arm"),
         ("import nothing_like_this", "ModuleNotFoundError: No module named 'nothing_like_this'"),
-        ("x = 1 + ''", "TypeError: unsupported operand"),
         ("from dataclasses import dataclass\n@dataclass\nclass A:\n  x: int", "is no class of"),
         ("class B: pass", "has no attribute 'A'"),
         ("read: return [0.0], [0.0]", "A.read gives 1 positions and 1 velocities; positions and"),
@@ -253,7 +252,6 @@ def test_rate_without_room_to_brake_is_refused(program: str, tmp_path: Path) -> 
         ("read: return [0.0] * 7, None", "gives 7 positions and velocities of shape (); positions"),
         ("read: return [0.0, 0.0, 0.0]", "gives [0.0, 0.0, 0.0]; positions and velocities needed"),
         ("read: return 2 * ([math.nan] * 7,)", "A.read gives a joint that is not finite"),
-        ("read: return 1 / 0", "A.read: mine.py:3: ZeroDivisionError: division by zero"),
         ("read: assert helper()", "A.read: mine.py:5: ZeroDivisionError: division by zero"),
         ("wait: return None", "A.wait gives None; the time [s] since it was called last needed"),
         ("speak: pass", "mine.py:A has no read, write, which a class of thirdhand.Arm needs"),
@@ -300,12 +298,7 @@ def test_an_arm_that_was_led_stays_where_it_was_led_to() -> None:
     """So does one that stands elsewhere for another reason, after a moment."""
     arm = Led(Settings())
     begin = arm.position.copy()
-    stop = threading.Event()
-    with open_session() as session:
-        driver = threading.Thread(
-            target=follow, args=(arm, session, "thirdhand"), kwargs={"stop": stop}
-        )
-        driver.start()
+    with open_session() as session, driven(arm, session):
         until(lambda: hasattr(arm, "written"))
         arm.guided = True
         for step in range(20):
@@ -315,8 +308,6 @@ def test_an_arm_that_was_led_stays_where_it_was_led_to() -> None:
         arm.guided = False
         time.sleep(0.1)
         assert np.abs(arm.position - begin - 0.38).max() < 1e-6
-        stop.set()
-        driver.join(10)
 
 
 def test_an_arm_outside_its_limits_does_not_jump() -> None:

@@ -20,6 +20,7 @@ from thirdhand.core.limiter.stage import Limiter
 from thirdhand.settings.config import JointSettings
 
 TICK = 0.002  # [s]
+PERIOD = 0.001  # [s] of a drive
 COMMANDED = JointSettings()
 STRONG = JointSettings(velocity=(2.0,) * 7, acceleration=(30.0,) * 7, jerk=(4000.0,) * 7)
 # too weak to follow all commands
@@ -81,11 +82,16 @@ def sent(
     ]
 
 
+def drive(limits: JointSettings = STRONG, period: float = PERIOD) -> Playback:
+    """The playback of a drive at rest."""
+    return Playback(limits, AT, period_s=period)
+
+
 def play(
     playback: Playback,
     arriving: Iterable[Sent],
     seconds: float,
-    period: float,
+    period: float = PERIOD,
     elapsed: Sequence[float] = (-1.0,),
 ) -> Written:
     queue = sorted(arriving, key=lambda one: -one.at_s)
@@ -98,7 +104,7 @@ def play(
     return Written(*(np.array([step[k] for step in written]) for k in range(2)))
 
 
-def assert_held(limits: JointSettings, written: Written, period: float) -> None:
+def assert_held(limits: JointSettings, written: Written, period: float = PERIOD) -> None:
     position = np.vstack((AT, written.position))
     velocity = np.vstack((np.zeros((2, 7)), written.velocity))
     acceleration = np.diff(velocity, axis=0) / period
@@ -176,7 +182,7 @@ def test_limits_hold_whatever_network_and_clocks_do(
             -wishes_radps, at=(np.array(end.position) + offset_rad).clip(LOWER, UPPER), tick=tick
         )
         arriving = [*sent(commands, late), *sent(restarted, late, len(commands) * TICK + silent_s)]
-    playback = Playback(limits, AT, period_s=period)
+    playback = drive(limits, period)
     written = play(playback, arriving, len(wishes_radps) * TICK + 1.0, period, clocks)
     assert_held(limits, written, period)
 
@@ -184,12 +190,12 @@ def test_limits_hold_whatever_network_and_clocks_do(
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 9.0, -9.0])
 @pytest.mark.parametrize("which", ["position", "velocity"])
 def test_what_is_not_finite_or_outside_the_limits_moves_nothing(bad: float, which: str) -> None:
-    playback = Playback(COMMANDED, AT, period_s=0.001)
+    playback = drive(COMMANDED)
     position = [*AT]
     velocity = [0.0] * 7
     (position if which == "position" else velocity)[3] = bad
     arriving = sent([commanded(i, position, velocity) for i in range(100)])
-    assert (play(playback, arriving, 0.3, 0.001).position == AT).all()
+    assert (play(playback, arriving, 0.3).position == AT).all()
     assert playback.refused == 100
     assert "finite" in playback.reason or "limit" in playback.reason
 
@@ -201,17 +207,17 @@ def test_jump_within_the_limits_is_refused() -> None:
         Sent(message.at_s, message.command._replace(position=tuple(AT)))
         for message in sent(commands)[300::50]
     ]
-    playback = Playback(COMMANDED, AT, period_s=0.001)
+    playback = drive(COMMANDED)
     regular = [message for i, message in enumerate(sent(commands)) if i < 300 or i % 50]
-    written = play(playback, [*regular, *jumping], 1.0, 0.001)
+    written = play(playback, [*regular, *jumping], 1.0)
     assert (playback.refused, playback.reason) == (4, "a jump from the command before")
-    late, error_rad = behind(written, commands, 0.001)
+    late, error_rad = behind(written, commands)
     assert late < 0.006
     assert error_rad < 2e-3
 
 
 def test_another_number_of_joints_is_refused_and_named() -> None:
-    playback = Playback(COMMANDED, AT, period_s=0.001)
+    playback = drive(COMMANDED)
     playback.step([commanded(0, AT[:6], [0.0] * 6)])
     assert playback.reason == "6 joints, 7 needed"
 
@@ -221,9 +227,9 @@ def test_another_number_of_joints_is_refused_and_named() -> None:
 
 def test_it_brakes_20_ms_after_the_last_command() -> None:
     """The arm brakes as fast as its limits allow."""
-    playback = Playback(COMMANDED, AT, period_s=0.001)
+    playback = drive(COMMANDED)
     commands = motion(np.full((400, 7), 0.5))
-    written = play(playback, sent(commands), len(commands) * TICK + 1.0, 0.001)
+    written = play(playback, sent(commands), len(commands) * TICK + 1.0)
     moving = np.abs(written.velocity).max(axis=1)
     silent = round((len(commands) - 1) * TICK / 0.001)
     assert moving[silent + round(BRAKE_AFTER_S / 0.001) - 2] == pytest.approx(0.5, abs=1e-3)
@@ -231,16 +237,16 @@ def test_it_brakes_20_ms_after_the_last_command() -> None:
     jerk = min(COMMANDED.jerk)
     stop_s = BRAKE_AFTER_S + 0.5 / slowest + slowest / jerk
     assert not moving[silent + round(stop_s / 0.001) + 3 :].any()
-    assert_held(COMMANDED, written, 0.001)
+    assert_held(COMMANDED, written)
 
 
 def test_a_sequence_is_taken_up_again_within_a_tenth_of_a_second() -> None:
-    playback = Playback(STRONG, AT, period_s=0.001)
+    playback = drive()
     commands = motion(sway(2.0))
     cut = [message for message in sent(commands) if not 1.0 < message.at_s < 1.06]
-    written = play(playback, cut, 2.0, 0.001)
+    written = play(playback, cut, 2.0)
     assert np.abs(written.position[-1] - commands[-1].position).max() < 0.01
-    assert_held(STRONG, written, 0.001)
+    assert_held(STRONG, written)
 
 
 @pytest.mark.parametrize(
@@ -252,15 +258,15 @@ def test_after_silence_only_what_begins_at_the_arm_is_followed(
     off: float, speed: float, followed: bool, at_start: bool
 ) -> None:
     assert REJOIN_RAD == 0.05
-    playback = Playback(COMMANDED, AT, period_s=0.001)
+    playback = drive(COMMANDED)
     arm = AT
     if not at_start:
         arm = play(
-            playback, sent(motion(np.full((200, 7), 0.2))), 0.4 + 0.3 + REJOIN_AFTER_S, 0.001
+            playback, sent(motion(np.full((200, 7), 0.2))), 0.4 + 0.3 + REJOIN_AFTER_S
         ).position[-1]
     where = arm + off * np.eye(7)[2]
     after = [commanded(900 + i, where + i * TICK * speed, [speed] * 7) for i in range(40)]
-    written = play(playback, sent(after), 0.2, 0.001)
+    written = play(playback, sent(after), 0.2)
     assert (written.position == arm).all() == (not followed or off == 0.0)
     assert playback.refused == (0 if followed else 40)
     assert followed or "begin where the arm stands" in playback.reason
@@ -268,13 +274,13 @@ def test_after_silence_only_what_begins_at_the_arm_is_followed(
 
 def test_late_commands_do_not_move_a_stopped_arm() -> None:
     """Half a second of commands arrives at once, half a second late."""
-    playback = Playback(COMMANDED, AT, period_s=0.001)
+    playback = drive(COMMANDED)
     commands = motion(sway(1.5))
     held = [
         Sent(1.0, message.command) if 0.5 < message.at_s < 1.0 else message
         for message in sent(commands[:500])
     ]
-    written = play(playback, held, 1.5, 0.001)
+    written = play(playback, held, 1.5)
     assert (written.position[1000:] == written.position[999]).all()
     assert playback.refused > 200
 
@@ -285,8 +291,8 @@ def test_two_daemons_at_once_do_not_pull_the_arm_to_and_fro() -> None:
     """
     first = motion(sway(1.0))
     other = motion(-sway(1.0), tick=40_000)
-    playback = Playback(COMMANDED, AT, period_s=0.001)
-    written = play(playback, [*sent(first), *sent(other[10:], begin_s=10 * TICK)], 1.0, 0.001)
+    playback = drive(COMMANDED)
+    written = play(playback, [*sent(first), *sent(other[10:], begin_s=10 * TICK)], 1.0)
     assert np.abs(written.position[-1] - first[-1].position).max() < 0.01
     assert playback.refused > 400
 
@@ -307,7 +313,7 @@ def at_rate(rate_hz: int, seconds: float, *, at: Vector = AT) -> list[Sent]:
     return arriving
 
 
-def farthest_rad(written: Written, arriving: Sequence[Sent], period: float) -> float:
+def farthest_rad(written: Written, arriving: Sequence[Sent], period: float = PERIOD) -> float:
     """The largest distance between a written position and the newest command at that time [rad]."""
     when = [message.at_s for message in arriving]
     where = [message.command.position[0] for message in arriving]
@@ -320,7 +326,7 @@ def farthest_rad(written: Written, arriving: Sequence[Sent], period: float) -> f
 def test_commands_of_any_rate_are_played_back_at_their_own_pace(
     rate_hz: int, period: float
 ) -> None:
-    playback = Playback(STRONG, AT, period_s=period)
+    playback = drive(period=period)
     arriving = at_rate(rate_hz, 4.0)
     written = play(playback, arriving, 4.0, period)
     assert playback.tick_s == pytest.approx(1 / rate_hz, rel=1e-3)
@@ -350,27 +356,27 @@ def test_a_clock_that_is_set_does_not_change_the_pace(
         )
         for k, message in enumerate(at_rate(500, 4.0))
     ]
-    playback = Playback(STRONG, AT, period_s=0.001)
-    written = play(playback, arriving, 4.0, 0.001)
+    playback = drive()
+    written = play(playback, arriving, 4.0)
     assert playback.refused == 0
-    assert farthest_rad(written, arriving, 0.001) < 0.003
+    assert farthest_rad(written, arriving) < 0.003
 
 
 def test_daemon_of_another_rate_is_followed() -> None:
     """A daemon of another rate that takes over is followed at that rate."""
-    playback = Playback(STRONG, AT, period_s=0.001)
+    playback = drive()
     first = at_rate(250, 1.0)
-    stands = play(playback, first, 1.5, 0.001).position[-1]
+    stands = play(playback, first, 1.5).position[-1]
     second = at_rate(1000, 3.0, at=stands)
-    assert farthest_rad(play(playback, second, 3.0, 0.001), second, 0.001) < 0.003
+    assert farthest_rad(play(playback, second, 3.0), second) < 0.003
     assert playback.tick_s == pytest.approx(0.001, rel=1e-3)
 
 
 @pytest.mark.parametrize("rate_hz", [50, 60, 66])
 def test_commands_without_room_to_brake_are_refused(rate_hz: int) -> None:
     """The refused commands do not move the arm."""
-    playback = Playback(COMMANDED, AT, period_s=0.001)
-    assert (play(playback, at_rate(rate_hz, 2.0), 2.0, 0.001).position == AT).all()
+    playback = drive(COMMANDED)
+    assert (play(playback, at_rate(rate_hz, 2.0), 2.0).position == AT).all()
     period = f"{1000 / rate_hz:.0f} ms"
     assert playback.reason == playback.too_slow
     assert playback.too_slow == (
@@ -381,12 +387,12 @@ def test_commands_without_room_to_brake_are_refused(rate_hz: int) -> None:
 
 def test_commands_without_a_tick_length_are_refused() -> None:
     """Commands are refused if their stamps do not show the length of a tick."""
-    playback = Playback(COMMANDED, AT, period_s=0.001)
+    playback = drive(COMMANDED)
     unstamped = [
         message._replace(command=message.command._replace(stamp_ns=0))
         for message in at_rate(500, 1.0)
     ]
-    assert (play(playback, unstamped, 0.1, 0.001).position == AT).all()
+    assert (play(playback, unstamped, 0.1).position == AT).all()
     assert "no length of a tick" in playback.reason
     assert playback.reason.endswith("1 to 20 ms a tick needed")
     assert playback.too_slow == ""
@@ -395,7 +401,9 @@ def test_commands_without_a_tick_length_are_refused() -> None:
 # --- accuracy ------------------------------------------------------------------------------------
 
 
-def behind(written: Written, commands: Sequence[Command], period: float) -> tuple[float, float]:
+def behind(
+    written: Written, commands: Sequence[Command], period: float = PERIOD
+) -> tuple[float, float]:
     """The delay [s] of the written positions, and their largest error apart from it [rad]."""
     times = TICK * np.arange(len(commands))
     positions, speed = (
@@ -432,7 +440,7 @@ def test_delay_error_and_smoothness_under_jitter(
     late_s = np.where(
         rng.uniform(size=len(commands)) < lost, math.nan, rng.uniform(0, jitter_s, len(commands))
     )
-    playback = Playback(STRONG, AT, period_s=period)
+    playback = drive(period=period)
     written = play(playback, sent(commands, late_s.tolist()), 6.0, period)
     late, error_rad = behind(written, commands, period)
     assert 0.0 < late < delay_s + period
@@ -447,18 +455,18 @@ def test_delay_error_and_smoothness_under_jitter(
 def test_slow_and_fast_loops_keep_pace(share: float) -> None:
     """A loop takes a step each 0.97 or 1.03 ms for a drive whose period is 1 ms."""
     commands = motion(sway(6.0))
-    playback = Playback(STRONG, AT, period_s=0.001)
+    playback = drive()
     arriving = [Sent(message.at_s / share, message.command) for message in sent(commands)]
-    written = play(playback, arriving, 6.0 / share, 0.001, [0.001 * share])
+    written = play(playback, arriving, 6.0 / share, PERIOD, [PERIOD * share])
     assert np.abs(written.position[-1] - commands[-1].position).max() < 0.02
     assert playback.delay_ticks < 3.0
-    assert_held(STRONG, written, 0.001)
+    assert_held(STRONG, written)
 
 
 def test_after_a_pause_of_its_loop_it_is_no_later_than_before() -> None:
     """The loop pauses for 60 ms each second; the network is punctual."""
     commands = motion(sway(6.0))
-    playback = Playback(STRONG, AT, period_s=0.001)
+    playback = drive()
     queue = list(reversed(sent(commands)))
     velocity: list[Vector] = []
     now_s = before_s = 0.0
@@ -485,8 +493,8 @@ def test_a_daemon_that_missed_deadlines_does_not_jerk_the_arm() -> None:
         jumped.append(
             Sent(tick * TICK, command._replace(tick=tick, stamp_ns=round(1e9 * TICK * tick)))
         )
-    playback = Playback(STRONG, AT, period_s=0.001)
-    written = play(playback, jumped, tick * TICK + 0.02, 0.001)
+    playback = drive()
+    written = play(playback, jumped, tick * TICK + 0.02)
     assert np.abs(np.diff(written.velocity, axis=0) / 0.001).max() < 6.0
     assert np.abs(np.diff(written.velocity, n=2, axis=0) / 0.001**2).max() < 2.5 * max(
         COMMANDED.jerk
@@ -499,10 +507,10 @@ def test_delay_grows_with_jitter_and_shrinks_again() -> None:
     rng = np.random.default_rng(5)
     commands = motion(sway(6.0))
     late_s = np.concatenate((np.zeros(500), rng.uniform(0, 0.01, 500), np.zeros(2001)))
-    playback = Playback(STRONG, AT, period_s=0.001)
+    playback = drive()
     delays = []
     for begin in range(0, 3000, 500):
-        play(playback, sent(commands[begin : begin + 500], late_s[begin:].tolist()), 1.0, 0.001)
+        play(playback, sent(commands[begin : begin + 500], late_s[begin:].tolist()), 1.0)
         delays.append(playback.delay_ticks)
     assert delays[0] < 1.1
     assert 2.5 < delays[1] < 8.0

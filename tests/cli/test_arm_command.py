@@ -9,11 +9,11 @@ import pytest
 from PIL import Image
 
 from support.cell import told
-from support.cell_commands import succeeded
-from support.paths import ROOT
+from support.cell_commands import assert_refused, succeeded
+from support.paths import ARMS
 from thirdhand.settings.config import Settings, load
 
-UR5 = ROOT / "service" / "thirdhand" / "arms" / "ur5.urdf"
+UR5 = ARMS / "ur5.urdf"
 
 
 @pytest.fixture(scope="module")
@@ -58,11 +58,9 @@ def test_what_it_writes_loads_and_is_drawn(made: tuple[Path, str]) -> None:
 def test_nothing_that_is_there_is_overwritten(made: tuple[Path, str]) -> None:
     folder, _ = made
     before = {file: file.read_bytes() for file in folder.iterdir()}
-    done = told("arm", str(folder / "my.urdf"), "--output", str(folder / "cell.toml"))
-    assert (
-        done.returncode,
-        "cell.toml exists already: name another file by --output" in done.stderr,
-    ) == (1, True)
+    words = "cell.toml exists already: name another file by --output"
+    arguments = ("arm", str(folder / "my.urdf"), "--output", str(folder / "cell.toml"))
+    assert_refused(1, words, *arguments)
     assert {file: file.read_bytes() for file in folder.iterdir()} == before
 
 

@@ -5,7 +5,6 @@ glass and holds it over the board.
 from __future__ import annotations
 
 import json
-import subprocess
 import sys
 import threading
 from pathlib import Path
@@ -18,7 +17,7 @@ from mcap_ros2.decoder import DecoderFactory
 from support.cell import thirdhand
 from support.cell_commands import succeeded
 from support.paths import ROOT
-from support.recorded import drawn_ticks
+from support.recorded import drawn_ticks, frames_of
 from thirdhand.client import Client, Tracker, UnreachableError, open_session
 from thirdhand.command_line import main
 from thirdhand.contract.records import Mode, Reason
@@ -47,10 +46,7 @@ seed = 7
 
 def demonstrated(*arguments: str, cwd: Path = ROOT) -> dict[str, Any]:
     """The report of a demo that succeeds."""
-    command = [sys.executable, "-m", "thirdhand", "demo", "--json", *arguments]
-    done = subprocess.run(
-        command, cwd=cwd, capture_output=True, text=True, timeout=320, check=False
-    )
+    done = thirdhand("demo", "--json", *arguments, timeout=320, cwd=cwd)
     assert done.returncode == 0, done.stdout + done.stderr
     report: dict[str, Any] = json.loads(done.stdout)
     assert report["success"]
@@ -68,9 +64,7 @@ def test_task_succeeds_in_new_places_and_replays(tmp_path: Path) -> None:
     for name in ("handover", "grasp", "carry"):
         assert report["events"][name]["reached"]
         assert report["events"][name]["error_mm"] <= 30
-    recorded = [
-        step.tick for step in Recording.open(report["recording"]).steps() if step.frame is not None
-    ]
+    recorded = frames_of(Path(report["recording"]))["tick"].tolist()
     assert drawn_ticks(Path(report["rrd"]), "/joints/velocity") == recorded
     succeeded("replay", "--exact", report["recording"])
     left = {"joints/command", "tool/target", "frame", "objects"}
@@ -169,6 +163,9 @@ def test_the_service_ends_before_the_arm_that_it_moves(tmp_path: Path) -> None:
     assert Reason.ARM_SILENT not in frames["reason"]
 
 
+MISSING = "1 of 9000 ticks are not recorded"
+
+
 def report_of(*whys: str | None, missing: str = "", **more: Any) -> dict[str, Any]:
     """The report of a demo: an event is reached unless a reason for its failure is given."""
     events = {
@@ -200,9 +197,9 @@ def report_of(*whys: str | None, missing: str = "", **more: Any) -> dict[str, An
     ("why", "missing", "code"),
     [
         (None, "", 0),
-        (None, "1 of 9000 ticks are not recorded", 1),
+        (None, MISSING, 1),
         ("the arm held", "", 1),
-        ("the arm held", "1 of 9000 ticks are not recorded", 1),
+        ("the arm held", MISSING, 1),
     ],
 )
 def test_demo_fails_by_a_missed_event_or_missing_ticks(
@@ -227,10 +224,7 @@ SILENT = report_of(None, None, None) | {"busy": "nobody answers"}
         ([HELD | {"busy": BUSY}, report_of(None, None, None)], 2, 0),
         ([HELD | {"busy": BUSY}] * 4, 3, 1),
         (
-            [
-                report_of(None, None, None, missing="1 of 9000 ticks are not recorded")
-                | {"busy": BUSY}
-            ],
+            [report_of(None, None, None, missing=MISSING) | {"busy": BUSY}],
             1,
             1,
         ),

@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from support.statuses import holding
 from thirdhand.cli.diagnosis import Y_UP, Finding, findings
 from thirdhand.cli.status import rows
 from thirdhand.contract.incidents import what_to_do
@@ -19,28 +20,20 @@ from thirdhand.contract.requests import Percentiles, Source, Status
 from thirdhand.core.geometry import rotation
 from thirdhand.settings.config import converted
 
-NONE = Percentiles()
 GOOD = Source(rate_hz=100.0, age_ms=4.0, fresh=True, clock_ms=1.5, frame="base")
 BOXES = {"left": ((0.6, -0.3, 0.0), (1.0, 0.0, 0.3)), "right": ((0.7, 0.05, 0.0), (1.0, 0.4, 0.2))}
-HEALTHY = Status(
-    cell="lab",
+HEALTHY = msgspec.structs.replace(
+    holding("lab", 1000),
     mode="follow",
     reason="",
-    flags=(),
-    tick=1000,
-    rate_hz=500.0,
     missed=3,
     realtime=True,
     memory_locked=True,
     awake=True,
     skill="soldering",
-    via_points=(),
-    rejected={},
     hand_age_ms={"left": 4.0, "right": 4.0},
     hand_distance_m=0.5,
-    hand_limit_m_s=1.5,
     lateness_us=Percentiles(1, 90, 300),
-    work_us=NONE,
     latency_ms=Percentiles(1, 2, 3),
     scribe={"state": "recording", "lost": 0, "free_mb": 50_000.0, "errors": []},
     endpoints=("tcp/127.0.0.1:7447",),
@@ -57,6 +50,11 @@ HEALTHY = Status(
     deviation_m=0.02,
     threshold_m=0.7,
 )
+
+
+def differing(**fields: Any) -> Status:
+    """The status of a healthy cell, with other fields."""
+    return msgspec.structs.replace(HEALTHY, **fields)
 
 
 def diagnosed(
@@ -97,7 +95,7 @@ def test_healthy_cell_has_no_findings() -> None:
 def test_hand_below_the_table_shows_a_wrong_calibration() -> None:
     """Only if the hand is below the table all the time, and deeper than the tracker's noise."""
     below = {"right": 0.05, "left": 0.01}
-    (text,) = wrongs(diagnosed(msgspec.structs.replace(HEALTHY, below_table_m=below)))
+    (text,) = wrongs(diagnosed(differing(below_table_m=below)))
     assert "calibration        below the table top: right hand 5 cm" in text
     assert (
         "thirdhand calibrate --check measures by how much, thirdhand calibrate finds the pose"
@@ -254,16 +252,16 @@ def test_what_need_not_be_mended_is_a_note() -> None:
 
 def test_hidden_latency_is_unknown_and_lost_hands_are_not_near() -> None:
     """A latency that clocks hide is unknown; hands that have disappeared are not near."""
-    ahead = msgspec.structs.replace(HEALTHY, sources=source("left", clock_ms=-4000.0))
+    ahead = differing(sources=source("left", clock_ms=-4000.0))
     assert (
         rows(ahead)["latency"]
         == "unknown: the left hand's stamps are 4 s ahead of the daemon's clock"
     )
     assert rows(HEALTHY)["latency"] == "p50 1.00, p99 2.00, max 3.00 ms"
     lost_hand = msgspec.structs.replace(GOOD, fresh=False, age_ms=5000.0, rate_hz=0.0)
-    status = msgspec.structs.replace(HEALTHY, sources=HEALTHY.sources | {"left": lost_hand})
+    status = differing(sources=HEALTHY.sources | {"left": lost_hand})
     assert rows(status)["nearest"].endswith("; the left hand is assumed where it was last seen")
-    rejected = msgspec.structs.replace(HEALTHY, sources=source("right", rejected={"jumped": 3}))
+    rejected = differing(sources=source("right", rejected={"jumped": 3}))
     assert rows(rejected)["rejected"] == "right hand 3 jumped"
 
 
@@ -355,8 +353,7 @@ def test_busy_machine_is_named_before_arm_and_network(changed: dict[str, Any]) -
 def paths(*hands: tuple[tuple[float, float, float], tuple[float, float, float]]) -> list[Finding]:
     """The findings of statuses over two seconds with the left and right hand at these positions."""
     statuses = [
-        msgspec.structs.replace(
-            HEALTHY,
+        differing(
             tick=1000 * (i + 1),
             time_ns=HEALTHY.time_ns + round(2e9 * i / (len(hands) - 1)),
             hands_m={"left": left, "right": right},
@@ -385,7 +382,7 @@ def test_hands_on_the_table_do_not_mean_that_y_points_up() -> None:
 
 
 def test_a_tool_that_is_off_its_target_for_long_is_told() -> None:
-    first = msgspec.structs.replace(HEALTHY, target_m=(0.5, 0.2, 0.3))
+    first = differing(target_m=(0.5, 0.2, 0.3))
     now = {"target_m": (0.5, 0.15, 0.3)}
     lines = wrongs(diagnosed(first, **now))
     assert "tool               15 cm or more from its target for 2.0 s" in lines[0]
@@ -420,7 +417,7 @@ def test_a_hand_that_the_skill_does_without_need_not_be_there() -> None:
     }
     # a hand that was lost may be anywhere
     assert "nothing arrived for 3.0 s" in wrongs(diagnosed(**unseen | lost_fields))[0]
-    now = msgspec.structs.replace(HEALTHY, **unseen | {"target_m": None})
+    now = differing(**unseen | {"target_m": None})
     assert rows(now)["target"] == "none: the skill needs the left hand"
     assert (
         rows(msgspec.structs.replace(now, hands="both"))["target"]

@@ -17,7 +17,7 @@ import zenoh
 
 from support.cell import LEFT, Daemon, Tracker, until
 from support.cell_commands import started
-from thirdhand.arms.drive import follow
+from support.driven_arms import driven
 from thirdhand.arms.simulated import SimulatedArm
 from thirdhand.client import endpoints, open_session
 from thirdhand.command_line import main
@@ -41,20 +41,11 @@ OF_THE_MACHINE = {"machine", "loop", "real time", "memory", "disk"}
 
 
 @contextlib.contextmanager
-def driven(endpoint: str) -> Iterator[SimulatedArm]:
+def simulated(endpoint: str) -> Iterator[SimulatedArm]:
     """A simulated arm, driven on a session of its own."""
-    stop = threading.Event()
     arm = SimulatedArm(Settings())
-    with open_session(connect=[endpoint]) as session:
-        driver = threading.Thread(
-            target=follow, args=(arm, session, "thirdhand"), kwargs={"stop": stop}
-        )
-        driver.start()
-        try:
-            yield arm
-        finally:
-            stop.set()
-            driver.join(10)
+    with open_session(connect=[endpoint]) as session, driven(arm, session):
+        yield arm
 
 
 @contextlib.contextmanager
@@ -108,7 +99,7 @@ def test_a_cell_with_ones_own_arm_and_tracker(
             "let it publish under the cell's key, thirdhand/hands/left; or start the tracker"
         )
 
-        with driven(daemon.endpoint) as arm, Tracker(daemon.session) as tracker:
+        with simulated(daemon.endpoint) as arm, Tracker(daemon.session) as tracker:
             daemon.until(lambda status: status["mode"] == "follow")
             # the rate is known some time after the driver's first state
             for _ in range(5):
@@ -175,11 +166,12 @@ def test_foreign_port_is_distinguished_from_a_closed_one(
     assert "opens no Zenoh session" in capsys.readouterr().out
 
 
-def test_a_cell_of_another_name_is_pointed_out(capsys: pytest.CaptureFixture[str]) -> None:
-    with open_session(listen=["tcp/127.0.0.1:0"]) as near:
-        token = near.liveliness().declare_token("lab/bench2/daemon/1")
-        assert main(["doctor", "--connect", endpoints(near)[0], "--cell", "lab"]) == 1
-        token.undeclare()  # type: ignore[no-untyped-call]
+def test_a_cell_of_another_name_is_pointed_out(
+    listener: zenoh.Session, capsys: pytest.CaptureFixture[str]
+) -> None:
+    token = listener.liveliness().declare_token("lab/bench2/daemon/1")
+    assert main(["doctor", "--connect", endpoints(listener)[0], "--cell", "lab"]) == 1
+    token.undeclare()  # type: ignore[no-untyped-call]
     output = capsys.readouterr().out
     assert (
         "nobody answers on lab/status: only daemons of other cells run there: lab/bench2" in output
@@ -187,16 +179,17 @@ def test_a_cell_of_another_name_is_pointed_out(capsys: pytest.CaptureFixture[str
     assert "give the name of the cell by --cell" in output
 
 
-def test_silent_daemon_is_distinguished_from_none(capsys: pytest.CaptureFixture[str]) -> None:
+def test_silent_daemon_is_distinguished_from_none(
+    listener: zenoh.Session, capsys: pytest.CaptureFixture[str]
+) -> None:
     """A daemon that runs but does not answer is distinguished from none."""
-    with open_session(listen=["tcp/127.0.0.1:0"]) as near:
-        token = occupy(near, "lab")
-        reach = ["--connect", endpoints(near)[0], "--cell", "lab"]
-        assert main(["doctor", *reach]) == 1
-        doctor = capsys.readouterr().out
-        assert main(["status", *reach]) == 1
-        status = capsys.readouterr().err
-        token.undeclare()  # type: ignore[no-untyped-call]
+    token = occupy(listener, "lab")
+    reach = ["--connect", endpoints(listener)[0], "--cell", "lab"]
+    assert main(["doctor", *reach]) == 1
+    doctor = capsys.readouterr().out
+    assert main(["status", *reach]) == 1
+    status = capsys.readouterr().err
+    token.undeclare()  # type: ignore[no-untyped-call]
     for output in (doctor, status):
         assert "its daemon is alive, but it is starting or ending" in output
         assert "start `thirdhand serve`" not in output

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from support.cell import thirdhand, told
-from support.cell_commands import succeeded
+from support.cell import thirdhand
+from support.cell_commands import assert_refused, succeeded
 from support.fine_motion import fine
 from support.paths import RECORDINGS
 from thirdhand.skills.skill_file import decoded
@@ -18,13 +18,19 @@ from thirdhand_sim.scene import Scene
 from thirdhand_sim.teach import demonstrations
 
 
+def written(folder: Path, name: str, *, count: int, seed: int) -> list[Path]:
+    """The files of a teacher's demonstrations."""
+    paths = [folder / f"{name}-{number}.mcap" for number in range(1, count + 1)]
+    takes = demonstrations(Scene(), count=count, seed=seed)
+    for path, demonstration in zip(paths, takes, strict=True):
+        write_demonstration(path, demonstration.every(8))
+    return paths
+
+
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     folder = tmp_path_factory.mktemp("demonstrations")
-    paths = [folder / f"demonstration-{number}.mcap" for number in (1, 2, 3)]
-    for path, demonstration in zip(paths, demonstrations(Scene(), count=3, seed=1), strict=True):
-        write_demonstration(path, demonstration.every(8))
-    return paths
+    return written(folder, "demonstration", count=3, seed=1)
 
 
 def test_a_skill_is_judged_drawn_and_written(files: list[Path], tmp_path: Path) -> None:
@@ -46,9 +52,8 @@ def test_an_unsafe_skill_is_not_written(files: list[Path], tmp_path: Path) -> No
     mirrored = demonstration.tool * np.array([1, -1, 1, 1, 1, 1, 1])
     write_demonstration(tmp_path / "mirrored.mcap", demonstration._replace(tool=mirrored))
     out = tmp_path / "skill.npz"
-    done = told("learn", *map(str, files), str(tmp_path / "mirrored.mcap"), "--output", str(out))
-    assert done.returncode == 1
-    assert "was not written: " in done.stderr
+    takes = (*map(str, files), str(tmp_path / "mirrored.mcap"))
+    done = assert_refused(1, "was not written: ", "learn", *takes, "--output", str(out))
     assert "contradict others" in done.stderr
     assert "unsafe: " not in done.stdout
     assert not out.exists()
@@ -76,11 +81,7 @@ def test_a_skill_is_refined_by_takes_of_ones_own(files: list[Path], tmp_path: Pa
     theirs = tmp_path / "theirs.npz"
     mine = tmp_path / "mine.npz"
     done = succeeded("learn", *map(str, files), "--output", str(theirs))
-    own_paths = [tmp_path / f"mine-{number}.mcap" for number in (1, 2)]
-    for path, demonstration in zip(
-        own_paths, demonstrations(Scene(), count=2, seed=5), strict=True
-    ):
-        write_demonstration(path, demonstration.every(8))
+    own_paths = written(tmp_path, "mine", count=2, seed=5)
     refine = ("learn", *map(str, own_paths), "--output", str(mine), "--from")
     done = succeeded(*refine, str(theirs))
     assert "the weight of your demonstrations against the skill's, with errors; " in done.stdout
@@ -94,6 +95,4 @@ def test_a_skill_is_refined_by_takes_of_ones_own(files: list[Path], tmp_path: Pa
         (own_paths[0], "not a skill"),
         (tmp_path / "missing.npz", "cannot read skill"),
     ):
-        done = told(*refine, str(skill))
-        assert done.returncode == 1
-        assert says in done.stderr
+        assert_refused(1, says, *refine, str(skill))

@@ -3,20 +3,13 @@
 from __future__ import annotations
 
 import shutil
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 
 from support.cell import told
-from support.in_process import ASSUMED, ticks_of
-from support.paths import ROOT
-from support.wam import URDF
-from thirdhand.core.controller import Controller, run
-from thirdhand.core.frame import Frame, Tick
+from support.cell_commands import python
+from support.in_process import record, ticks_of
 from thirdhand.core.skill.skill import Skill
-from thirdhand.recordings.recording import Recorder
 from thirdhand_sim.scene import Scene
 from thirdhand_sim.script import HandScript
 
@@ -36,15 +29,7 @@ if __name__ == "__main__":
 def files(skill: Skill, tmp_path_factory: pytest.TempPathFactory) -> list[str]:
     """Three short recordings, one of which is cut."""
     folder = tmp_path_factory.mktemp("many")
-    controller = Controller(ASSUMED, skill, urdf=URDF)
-    with Recorder(
-        folder / "a.mcap", settings=ASSUMED, skill=skill.file, state=controller.state
-    ) as recorder:
-
-        def keep(tick: Tick, frame: Frame) -> None:
-            recorder.write(tick, frame, time_ns=tick.index * 2_000_000)
-
-        run(controller, list(ticks_of(HandScript(Scene(), seed=4)))[:200], [keep])
+    record(folder / "a.mcap", skill, list(ticks_of(HandScript(Scene(), seed=4)))[:200])
     for name in NAMES[1:]:
         shutil.copy(folder / "a.mcap", folder / name)
     (folder / "broken.mcap").write_bytes((folder / "a.mcap").read_bytes()[:30_000])
@@ -79,19 +64,10 @@ def test_two_workers_print_what_one_process_prints(
 
 
 @pytest.mark.thorough
-def test_cluster_prints_what_one_process_prints(files: list[str], tmp_path: Path) -> None:
+def test_cluster_prints_what_one_process_prints(files: list[str]) -> None:
     pytest.importorskip("distributed")
-    script = tmp_path / "with_a_cluster.py"
-    script.write_text(DASK, encoding="utf-8")
     command = ["replay", "--each", *files]
-    done = subprocess.run(
-        [sys.executable, str(script), *command],
-        capture_output=True,
-        text=True,
-        timeout=110,
-        check=False,
-        cwd=ROOT,
-    )
+    done = python(DASK, *command, timeout=110)
     alone = told(*command)
     assert (done.returncode, done.stdout) == (alone.returncode, alone.stdout), done.stderr
     assert named_failures(done.stderr) == named_failures(alone.stderr)

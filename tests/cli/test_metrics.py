@@ -19,9 +19,10 @@ from prometheus_client.registry import Collector
 from support.cell import Tracker, serving, until
 from support.cell_commands import started
 from support.paths import ROOT
+from support.statuses import holding
 from thirdhand.client import Client
 from thirdhand.contract.records import Mode, Reason
-from thirdhand.contract.requests import Status
+from thirdhand.contract.requests import Percentiles, Source, Status
 from thirdhand.daemon.launch import free_port
 from thirdhand.workbench.cli.metrics import exposed
 
@@ -99,42 +100,30 @@ def test_metrics_are_those_of_the_status(tmp_path: Path) -> None:
             until(lambda: value(scrape(), "up") == 1, "it did not connect again", within_s=30)
 
 
-STATUS = {
-    "cell": "lab/one",
-    "mode": "hold",
-    "reason": "stale_hand",
-    "flags": ["stuck"],
-    "tick": 99,
-    "rate_hz": 499.5,
-    "missed": 7,
-    "realtime": True,
-    "memory_locked": False,
-    "awake": False,
-    "skill": 'a "skill"\\',
-    "via_points": [],
-    "rejected": {"jumped": 3},
-    "hand_age_ms": {},
-    "hand_distance_m": 0.25,
-    "hand_limit_m_s": 0.3,
-    **{
-        name: {"p50": 1.0, "p99": 2.0, "max": 4.0}
-        for name in ("lateness_us", "work_us", "latency_ms")
-    },
-    "scribe": {
+PERCENTILES = Percentiles(1.0, 2.0, 4.0)
+STATUS = msgspec.structs.replace(
+    holding("lab/one", 99),
+    reason="stale_hand",
+    flags=("stuck",),
+    missed=7,
+    skill='a "skill"\\',
+    rejected={"jumped": 3},
+    lateness_us=PERCENTILES,
+    latency_ms=PERCENTILES,
+    scribe={
         "state": "recording",
         "lost": 5,
         "restarts": 1,
         "free_mb": 1000,
         "mb_per_hour": 500.0,
     },
-    "endpoints": [],
-    "version": "0.1.0",
-    "sources": {"left": {"rate_hz": 100.0, "age_ms": 20.0}, "right": {}},
-    "segment": ["handover", "carry"],
-    "segment_belief": 0.75,
-    "error_probability": 0.5,
-    "memory_mb": {"daemon": 100.0},
-}
+    version="0.1.0",
+    sources={"left": Source(rate_hz=100.0, age_ms=20.0), "right": Source()},
+    segment=("handover", "carry"),
+    segment_belief=0.75,
+    error_probability=0.5,
+    memory_mb={"daemon": 100.0},
+)
 
 
 def exposition(statuses: dict[str, Status | None]) -> str:
@@ -150,8 +139,7 @@ def exposition(statuses: dict[str, Status | None]) -> str:
 
 
 def test_each_figure_has_its_unit_and_a_silent_cell_is_down() -> None:
-    now = msgspec.convert(STATUS, Status)
-    scraped = samples(exposition({"lab/one": now}))
+    scraped = samples(exposition({"lab/one": STATUS}))
     expected = {
         ("ticks_total",): 100,
         ("missed_deadlines_total",): 7,
@@ -176,7 +164,7 @@ def test_each_figure_has_its_unit_and_a_silent_cell_is_down() -> None:
     for kind, codes in (("mode", Mode), ("reason", Reason)):
         states = [state for (name, _), state in scraped.items() if name == f"thirdhand_{kind}"]
         assert (len(states), sum(states)) == (len(codes) - (codes is Reason), 1)
-    two = exposition({"lab/one": now, "lab/two": None})
+    two = exposition({"lab/one": STATUS, "lab/two": None})
     assert 'thirdhand_up{cell="lab/two"} 0.0' in two
     assert two.count('"lab/two"') == 1
     assert two.count("# TYPE thirdhand_up gauge") == 1
@@ -186,9 +174,7 @@ def test_the_alerts_use_metrics_that_exist() -> None:
     rules = [
         rule for group in yaml.safe_load(RULES.read_text())["groups"] for rule in group["rules"]
     ]
-    exported = {
-        name for name, _ in samples(exposition({"lab/one": msgspec.convert(STATUS, Status)}))
-    }
+    exported = {name for name, _ in samples(exposition({"lab/one": STATUS}))}
     named = {name for rule in rules for name in re.findall(r"thirdhand_\w+", rule["expr"])}
     assert len(rules) == 11
     assert len(named) > 8

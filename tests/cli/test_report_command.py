@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from support.recorded import frames_of
 from thirdhand.command_line import main
-from thirdhand.recordings.recording import Recording
 from thirdhand.settings import palette
 
 
@@ -76,7 +76,7 @@ def test_two_recordings_are_compared_on_a_page(
     assert float(modes[-1][0]) + float(modes[-1][1]) == pytest.approx(20.03, abs=0.02)
 
     heads, *ticks = rows(folder / "golden" / "ticks.csv")
-    frames = [step.frame for step in Recording.open(golden).steps() if step.frame is not None]
+    frames = frames_of(golden)
     assert len(ticks) == len(frames)
     row = dict(zip(heads, ticks[5000], strict=True))
     assert int(row["tick"]) == int(frames[5000]["tick"])

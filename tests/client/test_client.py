@@ -33,39 +33,34 @@ from thirdhand.workbench.trackers.cell_view import carried_out
 from thirdhand_sim.sockets import CountingRelay
 
 Answer = Callable[[zenoh.Query], object]
+Answering = Callable[[str, Answer], None]  # declares a queryable with this key
+Breaking = tuple[zenoh.Session, Callable[[], None]]  # a session, and a call that cuts it off
 
 
 @pytest.fixture(scope="module")
-def daemon() -> Iterator[zenoh.Session]:
-    """A session that listens at a port that the system chose."""
-    with open_session(listen=["tcp/127.0.0.1:0"]) as session:
-        yield session
-
-
-@pytest.fixture(scope="module")
-def session(daemon: zenoh.Session) -> Iterator[zenoh.Session]:
+def session(listener: zenoh.Session) -> Iterator[zenoh.Session]:
     """A session that is connected to it."""
-    with open_session(connect=endpoints(daemon)) as connected:
+    with open_session(connect=endpoints(listener)) as connected:
         yield connected
 
 
 @pytest.fixture
-def answering(daemon: zenoh.Session) -> Iterator[Callable[[str, Answer], None]]:
+def answering(listener: zenoh.Session) -> Iterator[Answering]:
     """Declare queryables, until the test ends."""
     declared: list[Any] = []
 
     def answer(key: str, with_what: Answer) -> None:
         cell = key.rsplit("/", 1)[0]
-        if not living(daemon, cell):
+        if not living(listener, cell):
             declared.append(
-                daemon.liveliness().declare_token(channels.presence(cell, str(daemon.zid())))
+                listener.liveliness().declare_token(channels.presence(cell, str(listener.zid())))
             )
 
         def reply(query: zenoh.Query) -> None:
             with query:
                 with_what(query)
 
-        declared.append(daemon.declare_queryable(key, reply))
+        declared.append(listener.declare_queryable(key, reply))
 
     yield answer
     for queryable in declared:
@@ -83,21 +78,21 @@ def ready(query: zenoh.Query) -> None:
 
 
 def test_sessions_find_each_other_by_name_only(
-    daemon: zenoh.Session, session: zenoh.Session
+    listener: zenoh.Session, session: zenoh.Session
 ) -> None:
     """There is no scouting: a session connects only to endpoints that it was given."""
     with open_session(listen=["tcp/127.0.0.1:0"]) as stranger:
         time.sleep(0.5)
-        assert list(session.info.peers_zid()) == [daemon.zid()]
+        assert list(session.info.peers_zid()) == [listener.zid()]
         assert list(stranger.info.peers_zid()) + list(stranger.info.routers_zid()) == []
-        assert stranger.zid() not in list(daemon.info.peers_zid())
+        assert stranger.zid() not in list(listener.info.peers_zid())
 
 
 # --- requests ------------------------------------------------------------------------------------
 
 
 def test_a_refusal_is_raised_with_the_daemons_words(
-    session: zenoh.Session, answering: Callable[[str, Answer], None]
+    session: zenoh.Session, answering: Answering
 ) -> None:
     answering("bench/status", ready)
     answering("bench/hold", lambda query: query.reply_err("not now: º".encode()))
@@ -108,7 +103,7 @@ def test_a_refusal_is_raised_with_the_daemons_words(
 
 
 def test_via_points_are_asked_for_as_the_wire_says(
-    session: zenoh.Session, answering: Callable[[str, Answer], None]
+    session: zenoh.Session, answering: Answering
 ) -> None:
     asked: list[bytes] = []
 
@@ -129,7 +124,7 @@ def test_via_points_are_asked_for_as_the_wire_says(
 
 
 def test_points_with_numbers_of_numpy_are_taught(
-    daemon: zenoh.Session, session: zenoh.Session, answering: Callable[[str, Answer], None]
+    listener: zenoh.Session, session: zenoh.Session, answering: Answering
 ) -> None:
     taught: list[requests.Add] = []
 
@@ -163,15 +158,15 @@ def test_where_nobody_answers_the_cell_is_named(session: zenoh.Session) -> None:
 
 @pytest.mark.parametrize("suffix", ["hold", "status"])
 def test_lost_query_is_repeated_if_that_is_safe(
-    daemon: zenoh.Session,
+    listener: zenoh.Session,
     session: zenoh.Session,
-    answering: Callable[[str, Answer], None],
+    answering: Answering,
     suffix: str,
 ) -> None:
     """A lost query is repeated only if repeating it does nothing twice."""
     lost: list[zenoh.Query] = []
     client = Client(session, "bench", timeout_s=2.0)
-    with daemon.declare_queryable("bench/resume", lost.append):
+    with listener.declare_queryable("bench/resume", lost.append):
         answering("bench/via_points", ready)
         client.ask("via_points", {"op": "list"})
 
@@ -195,9 +190,9 @@ def test_lost_query_is_repeated_if_that_is_safe(
 
 
 @pytest.fixture
-def breaking(daemon: zenoh.Session) -> Iterator[tuple[zenoh.Session, Callable[[], None]]]:
-    """A session to the daemon, and a call that breaks its connection for 0.3 s."""
-    (target,) = endpoints(daemon)
+def breaking(listener: zenoh.Session) -> Iterator[Breaking]:
+    """A session to the listener, and a call that breaks its connection for 0.3 s."""
+    (target,) = endpoints(listener)
     relays = [CountingRelay(target)]
     timers = list[threading.Timer]()
     endpoint = relays[0].endpoint
@@ -219,9 +214,7 @@ def breaking(daemon: zenoh.Session) -> Iterator[tuple[zenoh.Session, Callable[[]
         relay.__exit__()
 
 
-def test_requests_survive_a_broken_connection(
-    breaking: tuple[zenoh.Session, Callable[[], None]], answering: Callable[[str, Answer], None]
-) -> None:
+def test_requests_survive_a_broken_connection(breaking: Breaking, answering: Answering) -> None:
     """`status`, `via_points` and `hold` survive a connection that breaks before the answer."""
     session, cut = breaking
     asked: list[str] = []
@@ -246,9 +239,7 @@ def test_requests_survive_a_broken_connection(
     assert asked == ["bench/status"] * 2 + ["bench/hold"] * 2 + ["bench/via_points"] * 3
 
 
-def test_order_with_a_lost_answer_is_not_repeated(
-    breaking: tuple[zenoh.Session, Callable[[], None]], answering: Callable[[str, Answer], None]
-) -> None:
+def test_order_with_a_lost_answer_is_not_repeated(breaking: Breaking, answering: Answering) -> None:
     """The order may have been carried out."""
     session, cut = breaking
     resumed: list[str] = []
@@ -272,14 +263,14 @@ def test_order_with_a_lost_answer_is_not_repeated(
     assert len(resumed) == 3
 
 
-def test_known_daemon_is_not_asked_again(daemon: zenoh.Session, session: zenoh.Session) -> None:
+def test_known_daemon_is_not_asked_again(listener: zenoh.Session, session: zenoh.Session) -> None:
     """The answer of a known daemon counts, though its liveliness token has disappeared."""
-    with daemon.declare_queryable(
+    with listener.declare_queryable(
         "bench/status", lambda query: query.reply(query.key_expr, encoded)
     ):
         client = Client(session, "bench", timeout_s=1.0)
         encoded = requests.encode_json(STATUS)
-        with daemon.liveliness().declare_token(channels.presence("bench", str(daemon.zid()))):
+        with listener.liveliness().declare_token(channels.presence("bench", str(listener.zid()))):
             assert client.wait_until_ready() == STATUS
         assert client.status() == STATUS
         with pytest.raises(UnreachableError, match="A Zenoh storage answered"):

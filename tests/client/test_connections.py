@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 
 import pytest
 import zenoh
 
 from support.cell import until
+from support.cell_commands import python
 from thirdhand.client import Connection, UnreachableError, Watch, connect, endpoints, open_session
 from thirdhand.client import connection as calls
 
@@ -41,13 +42,6 @@ os.kill(os.getpid(), signal.SIGKILL)
 """
 
 
-@pytest.fixture
-def listener() -> Iterator[zenoh.Session]:
-    """A session that listens in the daemon's place."""
-    with open_session(listen=["tcp/127.0.0.1:0"]) as session:
-        yield session
-
-
 @pytest.mark.skipif(sys.platform == "win32", reason="no signal can be sent to one process")
 def test_connecting_ends_soon_after_ctrl_c() -> None:
     with socket.create_server(("127.0.0.1", 0)) as silent:
@@ -72,8 +66,7 @@ def test_connecting_is_tried_until_its_timeout() -> None:
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no fork")
 def test_a_fork_of_a_connected_program_says_so(listener: zenoh.Session) -> None:
-    command = [sys.executable, "-W", "ignore", "-c", FORK, *endpoints(listener)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    done = python(FORK, *endpoints(listener), env=os.environ | {"PYTHONWARNINGS": "ignore"})
     assert (done.returncode, done.stdout) == (0, "True\n" * 5), done.stderr
 
 

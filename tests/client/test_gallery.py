@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import os
 import re
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from support.cell import LISTENING, Tracker, serving
+from support.cell_commands import python
 from support.paths import ROOT
 
 PAGE = (ROOT / "docs" / "gallery.md").read_text(encoding="utf-8")
@@ -45,14 +44,7 @@ def output(name: str, endpoint: str, *arguments: str) -> str:
     """What a program prints."""
     code = PROGRAMS[name]
     assert len([line for line in code.splitlines() if line]) <= 10
-    done = subprocess.run(
-        [sys.executable, "-c", code, *arguments],
-        env=os.environ | {"THIRDHAND_CONNECT": endpoint},
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
+    done = python(code, *arguments, env=os.environ | {"THIRDHAND_CONNECT": endpoint})
     assert (done.returncode, done.stderr) == (0, "")
     return done.stdout
 

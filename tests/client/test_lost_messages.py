@@ -72,27 +72,26 @@ def test_a_starved_subscriber_knows_how_many_messages_it_lost(
     assert [line for line in capsys.readouterr().err.splitlines() if "lost" in line] == [warning]
 
 
-def test_slow_loop_counts_what_its_queue_dropped() -> None:
+def test_slow_loop_counts_what_its_queue_dropped(listener: zenoh.Session) -> None:
     """Message numbers may wrap around."""
-    with open_session(listen=["tcp/127.0.0.1:0"]) as session:
-        publisher = session.declare_publisher("thirdhand/clutch")
-        true = channels.BY_KEY["clutch"].codec.encode(True)
-        with Watch(session, "thirdhand", "clutch") as watch:
-            for number in (2**32 - 2, 2**32 - 1, 0, 3):
+    publisher = listener.declare_publisher("thirdhand/clutch")
+    true = channels.BY_KEY["clutch"].codec.encode(True)
+    with Watch(listener, "thirdhand", "clutch") as watch:
+        for numbers, lost in (
+            ((2**32 - 2, 2**32 - 1, 0, 3), 2),
+            (range(4, 260), 6),  # the queue holds 256 of 260
+        ):
+            for number in numbers:
                 publisher.put(true, source_info=zenoh.SourceInfo(publisher.id, number))
-            until(lambda: watch.lost == 2)
-            for number in range(4, 260):
-                publisher.put(true, source_info=zenoh.SourceInfo(publisher.id, number))
-            until(lambda: watch.lost == 6)  # the queue holds 256 of 260
+            until(lambda lost=lost: watch.lost == lost)
 
 
 @pytest.mark.parametrize(
     ("suffix", "setting"),
     [("tool/wish", r', with `\[skill\] source = "tool/wish"`'), ("hands/left", "")],
 )
-def test_who_is_not_heard_is_told_the_setting(suffix: str, setting: str) -> None:
-    with (
-        open_session(listen=["tcp/127.0.0.1:0"]) as session,
-        pytest.raises(UnreachableError, match=f"nobody listens.* in this cell{setting}\\?"),
-    ):
-        wait_until_heard(Publisher(session, "bench", suffix), timeout_s=0.1)
+def test_who_is_not_heard_is_told_the_setting(
+    suffix: str, setting: str, listener: zenoh.Session
+) -> None:
+    with pytest.raises(UnreachableError, match=f"nobody listens.* in this cell{setting}\\?"):
+        wait_until_heard(Publisher(listener, "bench", suffix), timeout_s=0.1)

@@ -42,6 +42,15 @@ def _pose(position: Any, orientation: Any) -> Any:
     return ROS.types["geometry_msgs/msg/Pose"](point(*position), quaternion(*orientation))
 
 
+def _transform(stamp_ns: int, parent: str, child: str, translation: Any, orientation: Any) -> Any:
+    vector = ROS.types["geometry_msgs/msg/Vector3"]
+    quaternion = ROS.types["geometry_msgs/msg/Quaternion"]
+    transform = ROS.types["geometry_msgs/msg/Transform"]
+    return ROS.types["geometry_msgs/msg/TransformStamped"](
+        _header(stamp_ns, parent), child, transform(vector(*translation), quaternion(*orientation))
+    )
+
+
 def _bytes(kind: str, *fields: Any) -> bytes:
     return bytes(ROS.serialize_cdr(ROS.types[kind](*fields), kind))
 
@@ -200,14 +209,7 @@ def test_texts_are_the_bytes_of_another_implementation(text: str) -> None:
 def test_transforms_are_the_bytes_of_another_implementation(
     stamp_ns: int, items: list[Any]
 ) -> None:
-    transform = ROS.types["geometry_msgs/msg/Transform"]
-    stamped = ROS.types["geometry_msgs/msg/TransformStamped"]
-    vector = ROS.types["geometry_msgs/msg/Vector3"]
-    quaternion = ROS.types["geometry_msgs/msg/Quaternion"]
-    theirs = [
-        stamped(_header(stamp_ns, parent), child, transform(vector(*xyz), quaternion(*turn)))
-        for parent, child, xyz, turn in items
-    ]
+    theirs = [_transform(stamp_ns, *item) for item in items]
     ours = cdr.encode_transforms(stamp_ns, [messages.Transform(*item) for item in items])
     assert ours == _bytes("tf2_msgs/msg/TFMessage", theirs)
     read = [
@@ -226,11 +228,6 @@ def test_transforms_are_the_bytes_of_another_implementation(
 
 
 def test_each_frame_of_a_message_has_its_stamp_and_parent() -> None:
-    stamped = ROS.types["geometry_msgs/msg/TransformStamped"]
-    transform = ROS.types["geometry_msgs/msg/Transform"]
-    vector = ROS.types["geometry_msgs/msg/Vector3"]
-    quaternion = ROS.types["geometry_msgs/msg/Quaternion"]
-    still = transform(vector(1.0, 2.0, 3.0), quaternion(0.0, 0.0, 0.0, 1.0))
     frames = {
         "wrist": (1, "world"),
         "my_wrist": (2, "w"),
@@ -238,9 +235,8 @@ def test_each_frame_of_a_message_has_its_stamp_and_parent() -> None:
         "wrist_2": (4, ""),
         "é": (5, "map"),
     }
-    theirs = [
-        stamped(_header(stamp, parent), child, still) for child, (stamp, parent) in frames.items()
-    ]
+    pose = (1.0, 2.0, 3.0), (0.0, 0.0, 0.0, 1.0)
+    theirs = [_transform(stamp, parent, child, *pose) for child, (stamp, parent) in frames.items()]
     data = _bytes("tf2_msgs/msg/TFMessage", theirs)
     decoded = [
         (name, pose.stamp_ns, pose.frame_id)
@@ -293,12 +289,15 @@ def test_cdr2_is_read_in_both_byte_orders_with_any_options(numbers: bytes) -> No
 
 
 @pytest.mark.parametrize(
-    "codec", [channels.POSE, channels.JOINTS, channels.TRANSFORMS, channels.OBJECTS]
+    ("codec", "data"),
+    [
+        (channels.POSE, POSE),
+        (channels.JOINTS, JOINTS),
+        (channels.TRANSFORMS, TRANSFORMS),
+        (channels.OBJECTS, OBJECTS),
+    ],
 )
-def test_messages_of_a_big_endian_machine_are_read(codec: channels.Codec) -> None:
-    data = {channels.POSE: POSE, channels.JOINTS: JOINTS, channels.TRANSFORMS: TRANSFORMS}.get(
-        codec
-    ) or OBJECTS
+def test_messages_of_a_big_endian_machine_are_read(codec: channels.Codec, data: bytes) -> None:
     store = get_typestore(Stores.ROS2_JAZZY)  # its MarkerArray equals the service's
     big = store.serialize_cdr(
         store.deserialize_cdr(data, codec.type), codec.type, little_endian=False

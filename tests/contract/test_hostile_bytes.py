@@ -38,13 +38,6 @@ def test_mutated_messages_are_taken_or_refused_in_words(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", DECODERS)
-def test_every_cut_of_a_message_is_taken_or_refused(name: str) -> None:
-    for data in seeds(name):
-        for size in range(len(data)):
-            check(name, data[:size])
-
-
-@pytest.mark.parametrize("name", DECODERS)
 @pytest.mark.parametrize("filler", [b"\0", b"\xff", b"\1\0\0\0", b"[", b'{"a":', b'"', b"9"])
 def test_what_is_large_is_answered_soon(name: str, filler: bytes) -> None:
     begin = time.process_time()

@@ -13,18 +13,17 @@ import pytest
 
 from support.cell import thirdhand, told
 from support.cell_commands import assert_refused, succeeded
-from support.in_process import ASSUMED, ticks_of
+from support.in_process import record, ticks_of
 from support.paths import RECORDINGS
-from support.recorded import thin
-from support.wam import URDF
-from thirdhand.core.controller import Controller, run
-from thirdhand.core.frame import STAGES, Frame, Tick
+from support.recorded import copied, thin
+from thirdhand.core.controller import Controller
+from thirdhand.core.frame import STAGES
 from thirdhand.core.skill.skill import Skill
 from thirdhand.core.tuning import TUNING
 from thirdhand.recordings import replay as replay_module
 from thirdhand.recordings.mcap_file import RecordingError
-from thirdhand.recordings.recording import DECISIONS, Recorder, Recording
-from thirdhand.recordings.replay import replay, ticks
+from thirdhand.recordings.recording import DECISIONS, Recording
+from thirdhand.recordings.replay import replay
 from thirdhand.skills.via_points import adapted
 from thirdhand_sim.golden import refresh
 from thirdhand_sim.scene import Scene
@@ -90,31 +89,14 @@ def recorded(skill: Skill, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A short session, with states, recorded in process."""
     path = tmp_path_factory.mktemp("recorded") / "short.mcap"
     taught = adapted(skill, Scene().via_points(), tolerance=0.05)
-    controller = Controller(ASSUMED, taught, urdf=URDF)
-    with Recorder(path, settings=ASSUMED, skill=taught.file, state=controller.state) as recorder:
-
-        def keep(tick: Tick, frame: Frame) -> None:
-            recorder.write(
-                tick,
-                frame,
-                time_ns=tick.index * 2_000_000,
-                state=controller.state if tick.index % 250 == 0 else None,
-            )
-
-        run(controller, list(ticks_of(HandScript(Scene(), seed=4)))[:1000], [keep])
-    return path
+    ticks = list(ticks_of(HandScript(Scene(), seed=4)))[:1000]
+    return record(path, taught, ticks, states_every=250)
 
 
 def test_a_change_of_one_nanoradian_is_found_and_named(recorded: Path, tmp_path: Path) -> None:
-    recording = Recording.open(recorded)
-    steps = list(recording.steps())
     path = tmp_path / "changed.mcap"
-    with Recorder(
-        path, settings=recording.settings, skill=recording.skill, state=steps[0].state
-    ) as recorder:
-        for tick, step in zip(
-            list(ticks_of(HandScript(Scene(), seed=4)))[:1000], steps[1:], strict=True
-        ):
+    with copied(Recording.open(recorded), path) as (recorder, steps):
+        for tick, step in steps:
             frame = step.frame.copy()
             if step.tick == 600:
                 frame["joints"][2] += 1e-9
@@ -130,14 +112,9 @@ def test_a_change_of_one_nanoradian_is_found_and_named(recorded: Path, tmp_path:
 
 
 def test_a_gap_is_continued_from_the_state_after_it(recorded: Path, tmp_path: Path) -> None:
-    recording = Recording.open(recorded)
-    steps = list(recording.steps())
-    taken = list(ticks_of(HandScript(Scene(), seed=4)))[:1000]
     path = tmp_path / "gap.mcap"
-    with Recorder(
-        path, settings=recording.settings, skill=recording.skill, state=steps[0].state
-    ) as recorder:
-        for tick, step in zip(taken, steps[1:], strict=True):
+    with copied(Recording.open(recorded), path) as (recorder, steps):
+        for tick, step in steps:
             if not 400 <= tick.index < 500:
                 recorder.write(
                     tick,
@@ -230,18 +207,12 @@ def test_recording_of_checksums_becomes_one_of_frames(
 def test_change_at_a_checksum_is_found_and_named(checked: Path, tmp_path: Path) -> None:
     """The frame of that tick is not recorded."""
     recording = Recording.open(checked)
-    steps = list(recording.steps(whole=False))
     path = tmp_path / "changed.mcap"
     table = np.array([*recording.checksums.values()], "<u4")
     table[601] ^= 1
-    with Recorder(
-        path,
-        settings=recording.settings,
-        skill=recording.skill,
-        state=steps[0].state,
-        checksums=table.tobytes(),
-    ) as recorder:
-        for tick, step in zip(ticks(recording), steps[1:], strict=True):
+    checksums = table.tobytes()
+    with copied(recording, path, whole=False, checksums=checksums) as (recorder, steps):
+        for tick, step in steps:
             recorder.write(tick, step.frame, time_ns=step.time_ns)
     result = replay(path)
     assert (result.ticks, result.identical, result.exact) == (1000, 999, False)

@@ -11,31 +11,33 @@ import numpy as np
 import pytest
 from pyarrow import parquet
 
-from support.in_process import ASSUMED, resting
+from support.in_process import record, resting
 from support.pictures import grey
+from support.recorded import copied
 from support.small_disk import small_disk
 from support.wam import JOINT_NAMES, URDF
 from thirdhand.command_line import main
 from thirdhand.contract import cdr
 from thirdhand.contract.images import CompressedImage, encode_image
-from thirdhand.core.controller import Controller, run
 from thirdhand.core.frame import Frame, Tick
-from thirdhand.recordings.recording import Recorder, Recording
-from thirdhand.recordings.replay import ticks
+from thirdhand.recordings.recording import Recording
 from thirdhand.skills.skill_file import StoredSkill
 
 FIRST = "chunk-000/file-000.parquet"
 LOST = range(3000, 3100)
 
 
+def converted(folder: Path, *arguments: str | Path) -> int:
+    """The exit code of the command that writes a data set into a folder."""
+    return main(["report", *map(str, arguments), "--lerobot", str(folder)])
+
+
 @pytest.fixture(scope="module")
 def gapped(golden: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Ten seconds of the golden session without 0.2 s of them."""
     path = tmp_path_factory.mktemp("gapped") / "gapped.mcap"
-    old = Recording.open(golden)
-    start, *steps = old.steps()
-    with Recorder(path, settings=old.settings, skill=old.skill, state=start.state) as recorder:
-        for tick, step in itertools.islice(zip(ticks(old), steps, strict=True), 5000):
+    with copied(Recording.open(golden), path) as (recorder, steps):
+        for tick, step in itertools.islice(steps, 5000):
             if tick.index not in LOST:
                 lost = len(LOST) * (tick.index == LOST.stop)
                 recorder.write(tick, step.frame, time_ns=step.time_ns, lost=lost)
@@ -45,13 +47,8 @@ def gapped(golden: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def data_set(gapped: Path, golden: Path) -> Path:
     folder = gapped.parent / "data"
-    files = [str(gapped), str(golden)]
-    assert (
-        main(
-            ["report", *files, "--lerobot", str(folder), "--fps", "30", "--task", "Hold the board."]
-        )
-        == 0
-    )
+    options = ("--fps", "30", "--task", "Hold the board.")
+    assert converted(folder, gapped, golden, *options) == 0
     return folder
 
 
@@ -86,11 +83,16 @@ def test_a_closure_that_never_changes_is_left_out(
     skill: StoredSkill, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A changing one is kept, also in the episodes where it is constant."""
-    still = recorded(tmp_path / "still.mcap", skill, resting(0, 600))
-    closing = recorded(tmp_path / "closing.mcap", skill, resting(0, 600), closing_at=300)
+
+    def close(frame: Frame) -> None:
+        if frame["tick"] >= 300:
+            frame["closure"] = 1.0
+
+    still = record(tmp_path / "still.mcap", skill, resting(0, 600))
+    closing = record(tmp_path / "closing.mcap", skill, resting(0, 600), change=close)
     for files, left_out in (([still], True), ([still, closing], False)):
         folder = tmp_path / f"{len(files)}"
-        assert main(["report", *map(str, files), "--lerobot", str(folder)]) == 0
+        assert converted(folder, *files) == 0
         printed = " ".join(capsys.readouterr().out.split())
         is_said = "rows, without action.gripper, which is always -1" in printed
         columns = parquet.read_table(folder / "data" / FIRST).column_names
@@ -169,10 +171,8 @@ def filmed(golden: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """
     pytest.importorskip("av", reason="videos need the extra `video`")
     path = tmp_path_factory.mktemp("filmed") / "filmed.mcap"
-    old = Recording.open(golden)
-    start, *steps = old.steps()
-    with Recorder(path, settings=old.settings, skill=old.skill, state=start.state) as recorder:
-        for tick, step in itertools.islice(zip(ticks(old), steps, strict=True), 3000):
+    with copied(Recording.open(golden), path) as (recorder, steps):
+        for tick, step in itertools.islice(steps, 3000):
             time_ns = step.time_ns + 3_600_000_000_000 * (tick.index >= 1500)
             recorder.write(tick, step.frame, time_ns=time_ns)
             if tick.index % 50 == 0:
@@ -180,21 +180,9 @@ def filmed(golden: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
                     CompressedImage(time_ns, "lens", "jpeg", grey(tick.index // 20))
                 )
                 recorder.image("camera/front", image, time_ns)
-    assert (
-        main(
-            [
-                "report",
-                str(path),
-                str(path),
-                "--lerobot",
-                str(path.parent / "data"),
-                "--task",
-                "Hold.",
-            ]
-        )
-        == 0
-    )
-    return path.parent / "data"
+    folder = path.parent / "data"
+    assert converted(folder, path, path, "--task", "Hold.") == 0
+    return folder
 
 
 def test_a_camera_is_a_video_with_a_picture_for_each_row(filmed: Path) -> None:
@@ -263,61 +251,34 @@ def test_lerobot_itself_loads_it(data_set: Path) -> None:
         assert loaded[i]["observation.state"].tolist() == rows["observation.state"][i].as_py()
 
 
-def recorded(
-    path: Path,
-    skill: StoredSkill,
-    inputs: list[Tick],
-    urdf: str = URDF,
-    *,
-    closing_at: int | None = None,
-) -> Path:
-    """A recording of an arm that does not report its joints; from the tick `closing_at` on, with a
-    gripper that is to be closed.
-    """
-    controller = Controller(ASSUMED, skill, urdf=URDF)
-    with Recorder(
-        path, settings=ASSUMED, skill=skill.file, state=controller.state, urdf=urdf
-    ) as recorder:
-
-        def keep(tick: Tick, frame: Frame) -> None:
-            if closing_at is not None and tick.index >= closing_at:
-                frame = frame.copy()
-                frame["closure"] = 1.0
-            recorder.write(tick, frame, time_ns=tick.index * 2_000_000)
-
-        run(controller, inputs, [keep])
-    return path
-
-
 def test_full_disk_leaves_nothing_behind(
     skill: StoredSkill, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The next attempt succeeds."""
-    path = recorded(tmp_path / "a.mcap", skill, resting(0, 100))
+    path = record(tmp_path / "a.mcap", skill, resting(0, 100))
     with small_disk(tmp_path / "disk", "24k") as disk:
-        assert main(["report", str(path), "--lerobot", str(disk / "data")]) == 1
+        assert converted(disk / "data", path) == 1
         assert (
             f"{disk}/data: No space left on device; room on that disk needed"
             in capsys.readouterr().err
         )
         assert list(disk.iterdir()) == []
         subprocess.run(["mount", "-o", "remount,size=4m", disk], check=True)
-        assert main(["report", str(path), "--lerobot", str(disk / "data")]) == 0
+        assert converted(disk / "data", path) == 0
 
 
 def test_there_are_no_data_sets_of_two_arms_or_of_nothing(
     skill: StoredSkill, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    followed = recorded(tmp_path / "a.mcap", skill, resting(0, 100))
-    of_another = recorded(
-        tmp_path / "b.mcap", skill, resting(0, 100), URDF.replace('"wam"', '"puma"', 1)
-    )
-    alone = recorded(tmp_path / "c.mcap", skill, [Tick(k) for k in range(100)])
+    followed = record(tmp_path / "a.mcap", skill, resting(0, 100))
+    puma = URDF.replace('"wam"', '"puma"', 1)
+    of_another = record(tmp_path / "b.mcap", skill, resting(0, 100), urdf=puma)
+    alone = record(tmp_path / "c.mcap", skill, [Tick(k) for k in range(100)])
     for files, why in (
         ([followed, of_another], "one arm is needed"),
         ([alone], "nothing was commanded after both hands had been seen"),
     ):
-        assert main(["report", *map(str, files), "--lerobot", str(tmp_path / "data")]) == 1
+        assert converted(tmp_path / "data", *files) == 1
         assert why in capsys.readouterr().err
         assert not (tmp_path / "data").exists()
 

@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from support.in_process import LEFT, RIGHT, arm, hand
-from support.recorded import thin
+from support.recorded import frames_of, thin
 from support.wam import URDF
 from support.wicked import wicked_skill
 from thirdhand.command_line import main
@@ -229,9 +229,7 @@ def test_spans_of_a_session_name_what_happened(session: Report) -> None:
 
 
 def test_rejections_and_limits_are_those_of_the_frames(session: Report) -> None:
-    frames = np.array(
-        [step.frame for step in Recording.open(session.path).steps() if step.frame is not None]
-    )
+    frames = frames_of(session.path)
     assert sum(rejection.samples for rejection in session.rejections) == int(
         frames[-1]["rejected"].sum()
     )
@@ -271,13 +269,7 @@ def test_a_via_point_is_missed_by_as_far_as_the_tool_is_from_it(
     """The hands rest where the via-point was taught, and the tool moves toward it."""
     Told(adapted(skill, [HERE], tolerance=0.05), tmp_path / "a.mcap")
     [point] = reported(tmp_path / "a.mcap").via_points
-    frames = np.array(
-        [
-            step.frame
-            for step in Recording.open(tmp_path / "a.mcap").steps()
-            if step.frame is not None
-        ]
-    )
+    frames = frames_of(tmp_path / "a.mcap")
     [visit] = point.visits
     assert visit.nearest_m == pytest.approx(
         np.linalg.norm(frames["tool"] - HERE.tool, axis=1).min()

@@ -43,14 +43,6 @@ def refusal(text: str) -> str:
     return str(caught.value)
 
 
-def test_limits_may_be_lowered() -> None:
-    settings = parse(
-        "[joints]\nvelocity = [1, 1, 1, 1, 1, 1, 0.5]\n[tool]\nmax_speed = 0.3", origin="cell.toml"
-    )
-    assert settings.joints.velocity[6] == 0.5
-    assert settings.tool.max_speed == 0.3
-
-
 @pytest.mark.parametrize(
     "name",
     [
@@ -140,16 +132,6 @@ def test_a_cell_that_is_no_key_or_no_folder_is_refused(name: str) -> None:
             "[network]\nconnect = ['tcp/127.0.0.1:1', 'tcp/10.0.0.1:1']",
             "[network] connect, entry 2",
             "or else allow_insecure",
-        ),
-        (
-            "[network]\nconnect = ['tls/10.0.0.1:1']",
-            "[network] certificate",
-            "the folder of one needed",
-        ),
-        (
-            "[network]\ncertificate = 'x'\nlisten = []\nconnect = ['tcp/127.0.0.1:1']",
-            "[network] connect, entry 1",
-            "tls/... needed",
         ),
         ("[network]\nrevoked = ['tracker']", "[network] revoked", "no client has a certificate"),
         (

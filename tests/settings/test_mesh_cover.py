@@ -7,6 +7,7 @@ from __future__ import annotations
 import re
 import struct
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,17 +17,32 @@ from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from support.paths import ROOT
+from support.paths import ARMS
 from thirdhand.core.geometry import rotation
 from thirdhand.core.separation.body import body_of
 from thirdhand.settings.arm_description import description
-from thirdhand.settings.config import Settings, converted, parse, robot_description, urdf_path
+from thirdhand.settings.config import Settings, converted, robot_description, urdf_path
 from thirdhand.settings.file_content import SettingsError
 from thirdhand.settings.mesh_cover import capsule_around, covered
 from thirdhand.settings.urdf import Shape, Urdf, UrdfError
 
-WAM = (ROOT / "service" / "thirdhand" / "arms" / "wam.urdf").read_text(encoding="utf-8")
+WAM = (ARMS / "wam.urdf").read_text(encoding="utf-8")
 Points = NDArray[np.float64]
+
+
+def arm_settings() -> dict[str, Any]:
+    """Settings of a cell whose arm has the WAM's joints."""
+    arm = Settings().arm
+    joints = Settings().joints
+    return {
+        "arm": {"urdf": "arm.urdf", "plate": arm.plate, "posture": list(arm.posture)},
+        "joints": {"acceleration": list(joints.acceleration), "jerk": list(joints.jerk)},
+    }
+
+
+def forearm(text: str) -> list[Shape]:
+    """The collision shapes of the forearm in a description."""
+    return [shape for shape in Urdf(text).shapes if shape.link == "forearm"]
 
 
 def outside(points: Points, ends: Points, radius: float) -> float:
@@ -113,24 +129,14 @@ def test_a_mesh_is_found_where_its_name_leads(
     urdf.write_text(described(name.format(folder=folder), ' scale="0.001 0.001 0.001"'))
     if "linked" in file:
         (folder / "cell" / "arm.urdf").symlink_to(urdf)
-    defaults = Settings()
-    lines = f"""
-        [arm]
-        urdf = "arm.urdf"
-        plate = "{defaults.arm.plate}"
-        posture = {list(defaults.arm.posture)}
-        link_radius = 1.0
-        packages = ["/nowhere", "{folder / packages}"]
-        [joints]
-        acceleration = {list(defaults.joints.acceleration)}
-        jerk = {list(defaults.joints.jerk)}
-    """
-    cell = parse(lines, origin="cell.toml", folder=folder / "cell")
+    document = arm_settings()
+    document["arm"] |= {"link_radius": 1.0, "packages": ["/nowhere", str(folder / packages)]}
+    cell = converted(document, origin="cell.toml", folder=folder / "cell")
     text = robot_description(cell)
     assert "covered_by" not in description(urdf_path(cell), cover=False)
     (folder / file).unlink()
     assert covered(text, tmp_path / "elsewhere.urdf") == text  # a recording needs no mesh files
-    shape = next(candidate for candidate in Urdf(text).shapes if candidate.link == "forearm")
+    (shape,) = forearm(text)
     points_m = points * 0.001 @ rotation(shape.rotation).T + shape.translation
     capsules = body_of(cell, text).capsules
     mine = [
@@ -224,11 +230,7 @@ def test_mesh_has_the_size_and_direction_of_the_urdf(
     """Unit and up axis of the file count too."""
     (tmp_path / name).write_bytes(data if isinstance(data, bytes) else data.encode())
     (tmp_path / "arm.urdf").write_text(described(name, scale))
-    shape = next(
-        candidate
-        for candidate in Urdf(description(tmp_path / "arm.urdf")).shapes
-        if candidate.link == "forearm"
-    )
+    (shape,) = forearm(description(tmp_path / "arm.urdf"))
     points_m = expected @ rotation(shape.rotation).T + shape.translation
     assert around(shape, points_m) <= 1e-5
     ends = np.reshape(shape.size[:6], (2, 3))
@@ -244,11 +246,7 @@ def test_each_mesh_of_a_link_has_its_capsule(tmp_path: Path) -> None:
         f'<mesh filename="a.stl"/></geometry>{second}',
     )
     (tmp_path / "arm.urdf").write_text(text)
-    shapes = [
-        shape
-        for shape in Urdf(description(tmp_path / "arm.urdf")).shapes
-        if shape.link == "forearm"
-    ]
+    shapes = forearm(description(tmp_path / "arm.urdf"))
     assert [round(shape.size[6], 2) for shape in shapes] == [0.04, 0.04]
     assert around(shapes[1], LEG + np.array((0.2, 0.0, 0.0))) <= 1e-5
 
@@ -273,23 +271,8 @@ def test_what_is_no_mesh_of_an_arm_is_refused(
 ) -> None:
     (tmp_path / "a.stl").write_bytes(data)
     (tmp_path / "arm.urdf").write_text(described("a.stl", scale))
-    defaults = Settings()
     with pytest.raises(SettingsError, match=re.escape(said)) as error:
-        converted(
-            {
-                "arm": {
-                    "urdf": "arm.urdf",
-                    "plate": defaults.arm.plate,
-                    "posture": list(defaults.arm.posture),
-                },
-                "joints": {
-                    "acceleration": list(defaults.joints.acceleration),
-                    "jerk": list(defaults.joints.jerk),
-                },
-            },
-            origin="cell.toml",
-            folder=tmp_path,
-        )
+        converted(arm_settings(), origin="cell.toml", folder=tmp_path)
     assert "forearm" in str(error.value)
 
 

@@ -83,10 +83,6 @@ REFUSED = {
         "the joints above 'x', 'y' form a cycle",
     ),
     "a closed loop through the plate": (more(fixed("tool0", "base_link")), "form a cycle"),
-    "a link on itself": (
-        more('<link name="x"/>' + fixed("x", "x")),
-        "the joints above 'x' form a cycle",
-    ),
     "a link with two parents": (
         more('<link name="x"/>' + fixed("x", "tool0", "second")),
         "link 'tool0' is the child of two joints, 'wrist_3-tool0_fixed_joint' and 'second'",
@@ -106,7 +102,6 @@ REFUSED = {
     "a velocity of 0": (every("velocity", "0"), "'shoulder_pan_joint' has the velocity 0; above 0"),
     "a velocity of inf": (every("velocity", "inf"), "'shoulder_pan_joint' has the velocity inf"),
     "no velocity": (every("velocity", None), "'shoulder_pan_joint' has the velocity none"),
-    "no lower limit": (every("lower", None), "'shoulder_pan_joint' has the limits none to"),
     "limits the other way round": (
         every("upper", "-9"),
         "'shoulder_pan_joint' has the limits -6.2832 to -9",
@@ -165,10 +160,8 @@ REFUSED = {
         b'<?xml version="1.0" encoding="klingon"?><robot/>',
         "unknown encoding",
     ),
-    "bytes": (bytes(range(256)), "no XML"),
     "an empty file": ("", "not a robot description"),
     "half a file": (UR5[: len(UR5) // 2], "no XML"),
-    "an SDF": ('<sdf version="1.6"><model name="arm"/></sdf>', "a <robot> with joints needed"),
     "a robot without joints": (
         '<robot name="r"><link name="a"/></robot>',
         "a <robot> with joints needed",

@@ -17,7 +17,7 @@ from thirdhand.core.arm.stage import ArmStage
 from thirdhand.recordings.shipped import ARMS, cell_of
 from thirdhand.settings.config import Settings, robot_description
 from thirdhand.settings.file_content import SettingsError
-from thirdhand.settings.reachable import Shell, workspace_of
+from thirdhand.settings.reachable import Shell, Workspace, workspace_of
 from thirdhand.settings.urdf import Urdf
 
 MOUNTS = {
@@ -36,6 +36,13 @@ def mounted(text: str, xyz: str, rpy: str) -> str:
         'link="base_link"/>'
         f'<origin xyz="{xyz}" rpy="{rpy}"/></joint></robot>',
     )
+
+
+def workspace(cell: Settings) -> Workspace:
+    """The workspace of a cell's arm, by its kinematics."""
+    chain = Urdf(robot_description(cell)).chain(cell.arm.plate)
+    joints = cell.joints
+    return workspace_of(chain, joints.lower, joints.upper, cell.tool.plate_from_tool)
 
 
 def reached(cell: Settings, points: NDArray[np.float64]) -> float:
@@ -98,28 +105,23 @@ def test_targets_of_the_default_reach_are_reached(
 def test_shipped_cells_have_the_reach_of_their_kinematics(arm: str) -> None:
     """The numbers agree approximately."""
     cell = cell_of(arm)
-    joints = cell.joints
     reach = cell.reach
-    chain = Urdf(robot_description(cell)).chain(cell.arm.plate)
-    workspace = workspace_of(chain, joints.lower, joints.upper, cell.tool.plate_from_tool)
-    shell = workspace.shell(reach.min_x, reach.min_z)
+    space = workspace(cell)
+    shell = space.shell(reach.min_x, reach.min_z)
     assert shell.centre == pytest.approx(reach.centre, abs=0.001)
     assert shell.outer == pytest.approx(reach.outer, abs=0.07)
     assert (
-        workspace.share(Shell(reach.centre, reach.inner, reach.outer), reach.min_x, reach.min_z)
-        > 0.99
+        space.share(Shell(reach.centre, reach.inner, reach.outer), reach.min_x, reach.min_z) > 0.99
     )
 
 
 def test_an_arm_on_a_rail_reaches_along_it(tmp_path: Path) -> None:
     cell = sliding_cell(tmp_path)
-    joints = cell.joints
-    chain = Urdf(robot_description(cell)).chain(cell.arm.plate)
-    workspace = workspace_of(chain, joints.lower, joints.upper, cell.tool.plate_from_tool)
-    assert workspace.shoulder == pytest.approx((0.0, 0.0, 0.089), abs=1e-3)
-    assert 1.15 < workspace.extent < 0.95 + 0.31  # the rail is 0.3 m long each way
+    space = workspace(cell)
+    assert space.shoulder == pytest.approx((0.0, 0.0, 0.089), abs=1e-3)
+    assert 1.15 < space.extent < 0.95 + 0.31  # the rail is 0.3 m long each way
     ends = np.array([(0.5, y, 0.2) for y in (-1.05, 1.05, -1.3, 1.3)])
-    assert workspace.reaches(ends).tolist() == [True, True, False, False]
+    assert space.reaches(ends).tolist() == [True, True, False, False]
     assert reached(cell, targets(cell, 40)) >= 0.95
 
 

@@ -180,7 +180,6 @@ def test_names_limits_and_reach_come_from_the_description(name: str) -> None:
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
-        ({"plate": 'plate = "gripper"'}, "no link 'gripper'"),
         ({"posture": ""}, "[arm] posture: missing; the URDF does not define it, 6 numbers needed"),
         (
             {"posture": "posture = [0, 0, 0]"},

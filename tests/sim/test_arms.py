@@ -13,21 +13,16 @@ import pinocchio as pin
 import pytest
 
 from support.arms import published
+from support.demo import SCENE, assert_soldered, soldered
 from support.franka_cell import allowed
-from thirdhand.contract.records import Mode
 from thirdhand.core.geometry import rotation
 from thirdhand.core.separation.body import body_of
 from thirdhand.daemon.launch import described
-from thirdhand.recordings.shipped import ARMS, cell_of, shipped_skill
+from thirdhand.recordings.shipped import ARMS, cell_of
 from thirdhand.settings.config import Box, Obstacles, Reach, Settings, parse, robot_description
 from thirdhand.settings.urdf import Urdf
-from thirdhand.skills.via_points import adapted
 from thirdhand_sim.bench import Bench
-from thirdhand_sim.lab.rehearsal import rehearse
-from thirdhand_sim.scene import Scene, SceneError
-from thirdhand_sim.script import HandScript
-
-SCENE = Scene()
+from thirdhand_sim.scene import SceneError
 
 
 @pytest.mark.parametrize("arm", ["franka", "ur5"])
@@ -35,7 +30,6 @@ def test_shipped_arm_does_the_task(arm: str) -> None:
     """The arm keeps its limits, and its distance from the hands."""
     cell = cell_of(arm)
     near = []
-    taught = adapted(shipped_skill(), SCENE.via_points(), tolerance=0.001).for_loop()
 
     def look(bench: Bench) -> None:
         if bench.tick % 10 == 0:
@@ -46,26 +40,15 @@ def test_shipped_arm_does_the_task(arm: str) -> None:
                 )
             )
 
-    run = rehearse(
-        HandScript(SCENE, seed=1),
-        lambda _: taught,
-        settings=cell,
-        rate_hz=100,
-        keep=True,
-        look=look,
-    )
-    assert run.events.success
-    assert max(run.errors_mm) <= 3.0, run.errors_mm
+    run = soldered(cell, look=look)
+    assert_soldered(run, cell)
     frames = run.frames
     limits = cell.joints
-    assert (frames["mode"][run.time_s > 0] == Mode.FOLLOW).all()
     assert (run.joints[:, 0] >= np.array(limits.lower) - 1e-3).all()
     assert (run.joints[:, 0] <= np.array(limits.upper) + 1e-3).all()
-    assert (np.abs(frames["joint_velocities"]) <= limits.velocity).all()
     assert (
         np.abs(frames["joint_accelerations"]) <= np.array(limits.acceleration) * (1 + 1e-9)
     ).all()
-    assert np.abs(run.joints[:, 0] - frames["joints"]).max() < 3e-3
     assert min(near) > 0.01
     if arm == "franka":
         low, high = allowed(frames["joints"])

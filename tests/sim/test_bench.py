@@ -35,6 +35,7 @@ from thirdhand_sim.script import GRIP_S, HandScript, Teacher
 from thirdhand_sim.teach import demonstrations
 
 STILL = (0.0,) * 7
+TURNING = np.array([0.8, 0, 0, 0, 0, 0, 0])  # [rad/s]
 
 
 class Follower:
@@ -150,13 +151,18 @@ def test_same_commands_give_same_run() -> None:
     assert traces[0] == traces[1]
 
 
+def turned(bench: Bench) -> npt.NDArray[np.float64]:
+    """The commanded joints [rad], after the first one has turned at TURNING for 0.2 s."""
+    joints = np.array(bench.observe().joints)
+    for _ in range(100):
+        joints = joints + 0.002 * TURNING
+        bench.step(tuple(joints), tuple(TURNING))
+    return joints
+
+
 def test_arm_brakes_without_commands(bench: Bench) -> None:
     """The arm brakes 20 ms after the last command."""
-    joints = np.array(bench.observe().joints)
-    speed = np.array([0.8, 0, 0, 0, 0, 0, 0])
-    for _ in range(100):
-        joints = joints + 0.002 * speed
-        bench.step(tuple(joints), tuple(speed))
+    joints = turned(bench)
     for _ in range(9):
         bench.step()
     assert bench.observe().joint_velocities[0] == pytest.approx(0.8, abs=0.01)
@@ -169,12 +175,11 @@ def test_arm_brakes_without_commands(bench: Bench) -> None:
 def test_arm_does_not_leap_after_commands(bench: Bench) -> None:
     """The commands are far ahead of the arm."""
     joints = np.array(bench.observe().joints)
-    speed = np.array([0.8, 0, 0, 0, 0, 0, 0])
     speeds = []
     for tick in range(400):
         # the bench had slept for 50 ms
-        joints = joints + (26 if tick == 100 else 1) * 0.002 * speed
-        observation = bench.step(tuple(joints), tuple(speed))
+        joints = joints + (26 if tick == 100 else 1) * 0.002 * TURNING
+        observation = bench.step(tuple(joints), tuple(TURNING))
         speeds.append(max(map(abs, observation.joint_velocities)))
     assert max(speeds) < 0.8 + 0.3
     assert observation.joints[0] == pytest.approx(joints[0] + 0.002 * 0.8, abs=1e-3)
@@ -182,22 +187,18 @@ def test_arm_does_not_leap_after_commands(bench: Bench) -> None:
 
 def test_late_commands_do_not_move_the_arm(bench: Bench) -> None:
     """A restored network delivers them."""
-    joints = np.array(bench.observe().joints)
-    speed = np.array([0.8, 0, 0, 0, 0, 0, 0])
-    for _ in range(100):
-        joints = joints + 0.002 * speed
-        bench.step(tuple(joints), tuple(speed))
+    joints = turned(bench)
     for _ in range(60):  # the network is cut for 120 ms
         stood = np.array(bench.step().joints)
-    late = [(joints + 0.002 * k * speed, speed) for k in range(1, 60)]
-    late.append((late[-1][0], 0 * speed))  # the service had stopped by then
+    late = [(joints + 0.002 * k * TURNING, TURNING) for k in range(1, 60)]
+    late.append((late[-1][0], 0 * TURNING))  # the service had stopped by then
     for position, velocity in late[::3] + late[-1:]:
         observation = bench.step(tuple(position), tuple(velocity))
         assert np.abs(np.array(observation.joints) - stood).max() < 2e-3
     assert bench.refused == 21
     # a service that takes over begins at the arm's position
     for k in range(100):
-        observation = bench.step(tuple(stood + 0.00001 * k**2 * speed), tuple(0.01 * k * speed))
+        observation = bench.step(tuple(stood + 0.00001 * k**2 * TURNING), tuple(0.01 * k * TURNING))
     assert observation.joints[0] - stood[0] == pytest.approx(0.00001 * 99**2 * 0.8, abs=0.01)
     assert bench.refused == 21
 
@@ -331,24 +332,16 @@ def test_arm_elsewhere_is_scored(network: tuple[zenoh.Session, str]) -> None:
     script = HandScript(SCENE, seed=1, speed=20.0)
     arm = threading.Thread(target=tell)
     with Bench(script, world=ObservedWorld) as bench, open_session(connect=[endpoint]) as session:
+
+        def play_live(live: Live) -> None:
+            run(bench, session, live, stop=threading.Event(), report=reports.append)
+
         with pytest.raises(BenchError, match="no joint states arrive on lab/joints/state"):
-            run(
-                bench,
-                session,
-                Live(cell="lab", wait_s=1.0),
-                stop=threading.Event(),
-                report=reports.append,
-            )
+            play_live(Live(cell="lab", wait_s=1.0))
         assert set(keys) == {"lab/hands/left", "lab/objects"}
         arm.start()
         try:
-            run(
-                bench,
-                session,
-                Live(cell="lab", once=True),
-                stop=threading.Event(),
-                report=reports.append,
-            )
+            play_live(Live(cell="lab", once=True))
         finally:
             over.set()
             arm.join()

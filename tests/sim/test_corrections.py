@@ -14,9 +14,9 @@ import pytest
 
 from support.cell import LEFT, LISTENING, Daemon, Tracker, serving, told
 from support.guided_bench import GuidedBench
+from support.recorded import frames_of
 from thirdhand.client import RefusedError
 from thirdhand.contract.records import Flag, Mode, Reason
-from thirdhand.recordings.recording import Recording
 from thirdhand.recordings.replay import replay
 from thirdhand.settings.config import Settings
 
@@ -115,9 +115,7 @@ def test_correction_from_end_to_end(tmp_path: Path) -> None:  # noqa: PLR0915 - 
     (path,) = records.glob("*.mcap")
     whole = tmp_path / "whole.mcap"
     assert replay(path, output=whole).exact
-    frames = np.array(
-        [step.frame for step in Recording.open(whole).steps() if step.frame is not None]
-    )
+    frames = frames_of(whole)
     assert not (frames["mode"] == Mode.FAULT).any()
     assert (frames["reason"] == Reason.GUIDED).sum() > RATE_HZ / 2
     commanded = frames[frames["commanded"] == 1]

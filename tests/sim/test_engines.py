@@ -8,17 +8,14 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
+from support.demo import SCENE, soldered
 from thirdhand.daemon.launch import ENGINES, LaunchError, engine_of
-from thirdhand.recordings.shipped import shipped_skill
-from thirdhand.skills.via_points import adapted
 from thirdhand_sim.bench import Bench
 from thirdhand_sim.engines import world_of
-from thirdhand_sim.lab.rehearsal import Rehearsed, rehearse
-from thirdhand_sim.scene import Scene
+from thirdhand_sim.scene import Point
 from thirdhand_sim.script import HandScript
 from thirdhand_sim.world import LEVEL, Pose, pixels
 
-SCENE = Scene()
 EYE = (1.66, -0.78, 0.80)
 TARGET = (0.53, -0.02, 0.31)
 SIZE = (160, 120)
@@ -37,18 +34,11 @@ def bench(engine: str) -> Iterator[Bench]:
         yield built
 
 
-def played(engine: str) -> Rehearsed:
-    taught = adapted(shipped_skill(), SCENE.via_points(), tolerance=0.001).for_loop()
-    return rehearse(
-        HandScript(SCENE, seed=1), lambda _: taught, world=world_of(engine), rate_hz=100, keep=True
-    )
-
-
 def test_engines_give_same_scores() -> None:
     """The arm's paths agree too."""
     if missing := [name for name in ENGINES if importlib.util.find_spec(name) is None]:
         pytest.skip(f"{ENGINES[missing[0]]} is not installed")
-    result, other = (played(name) for name in ENGINES)
+    result, other = (soldered(world=world_of(name)) for name in ENGINES)
     assert result.events.success
     assert other.events.success
     assert max(*result.errors_mm, *other.errors_mm) < 3.0
@@ -123,14 +113,18 @@ def test_pictures_show_what_is_there(bench: Bench) -> None:
         colours, matrix = bench.world.picture(eye=EYE, target=TARGET, size=SIZE)
     except (ImportError, RuntimeError) as error:
         pytest.skip(f"pictures of this engine need GL: {error}")
-    (across, down), *_ = pixels(np.array([np.add(SCENE.solder, (0, 0, 0.015))]), matrix, SIZE)
     assert colours.shape == (120, 160, 3)
     assert (colours[0, 0] == 255).all()  # the sky
-    red, _, blue = colours[round(down), round(across)].astype(int)
-    assert abs(red - blue) < 40  # grey: it stands on wood
-    (across, down), *_ = pixels(np.array([(1.0, -0.1, 0.0)]), matrix, SIZE)
-    red, _, blue = colours[round(down), round(across)].astype(int)
-    assert red - blue > 40
+
+    def redness(point: Point) -> int:
+        """The red of a point in the picture, less its blue."""
+        (across, down), *_ = pixels(np.array([point]), matrix, SIZE)
+        red, _, blue = colours[round(down), round(across)].astype(int)
+        return int(red - blue)
+
+    x, y, z = SCENE.solder
+    assert abs(redness((x, y, z + 0.015))) < 40  # grey: it stands on wood
+    assert redness((1.0, -0.1, 0.0)) > 40
 
 
 def test_missing_engine_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -39,6 +39,7 @@ from thirdhand_sim.lab.reproduction.letters import WRITTEN, gathered
 from thirdhand_sim.lab.reproduction.writing import write
 from thirdhand_sim.lab.results import ExperimentError, Options, Results
 
+THREE = ("letters", "statistics", "table")
 NAMED = {"commit", "date", "machine", "seeds", "options", "depends_on"}
 
 
@@ -217,6 +218,11 @@ class TestSeedOffset:
 class TestAll:
     """`all` with three small experiments, of which one fails."""
 
+    @staticmethod
+    def run_all(folder: Path, *more: str) -> int:
+        """The exit code of a run of the three experiments."""
+        return main(["all", "--output", str(folder), "--quiet", *more])
+
     @pytest.fixture(autouse=True)
     def runs(self, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
         """The number of runs of each experiment, and the error of the failing one."""
@@ -238,7 +244,7 @@ class TestAll:
             stub.run = run  # type: ignore[attr-defined]
             return stub
 
-        few = {name: EXPERIMENTS[name] for name in ("letters", "statistics", "table")}
+        few = {name: EXPERIMENTS[name] for name in THREE}
         for name in few:
             monkeypatch.setitem(
                 sys.modules, f"thirdhand_sim.lab.{EXPERIMENTS[name].module}", module(name)
@@ -259,22 +265,22 @@ class TestAll:
     ) -> None:
         """The next run makes only missing results."""
         runs["error"] = error
-        assert main(["all", "--output", str(tmp_path), "--quiet"]) == 1
+        assert self.run_all(tmp_path) == 1
         assert f"statistics: {error}" in capsys.readouterr().err.replace("Traceback", "").replace(
             "ValueError: ", "statistics: "
         )
         runs["error"] = None
-        assert main(["all", "--output", str(tmp_path), "--quiet"]) == 0
-        assert [runs[name] for name in ("letters", "statistics", "table")] == [1, 2, 1]
-        assert main(["all", "--output", str(tmp_path), "--anew", "--quiet"]) == 0
-        assert [runs[name] for name in ("letters", "statistics", "table")] == [2, 3, 2]
+        assert self.run_all(tmp_path) == 0
+        assert [runs[name] for name in THREE] == [1, 2, 1]
+        assert self.run_all(tmp_path, "--anew") == 0
+        assert [runs[name] for name in THREE] == [2, 3, 2]
         assert set(json.loads((tmp_path / "table.json").read_text())) > NAMED
 
     def test_makes_what_is_stale_and_lists_it(
         self, runs: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
         runs["error"] = None
-        assert main(["all", "--output", str(tmp_path), "--quiet"]) == 0
+        assert self.run_all(tmp_path) == 0
         path = tmp_path / "letters.json"
         path.write_text(path.read_text().replace(kmp_digest(), "of another version"))
         capsys.readouterr()
@@ -282,8 +288,8 @@ class TestAll:
         listed = capsys.readouterr().out.splitlines()
         assert [line.split()[0] for line in listed] == ["letters", "motion-of-others", "2"]
         assert "kmp changed since" in listed[0]
-        assert main(["all", "--output", str(tmp_path), "--quiet"]) == 0
-        assert [runs[name] for name in ("letters", "statistics", "table")] == [2, 1, 1]
+        assert self.run_all(tmp_path) == 0
+        assert [runs[name] for name in THREE] == [2, 1, 1]
 
     def test_file_that_is_no_result_is_named(
         self, runs: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -296,4 +302,4 @@ class TestAll:
             assert (
                 f"{tmp_path / 'letters.json'}: not the JSON of a result" in capsys.readouterr().err
             )
-        assert [runs[name] for name in ("letters", "statistics", "table")] == [0, 1, 1]
+        assert [runs[name] for name in THREE] == [0, 1, 1]

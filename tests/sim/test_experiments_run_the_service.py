@@ -13,8 +13,7 @@ import pytest
 
 pytest.importorskip("movement_primitives", reason="ProMPs need movement_primitives")
 
-from thirdhand.contract import cdr
-from thirdhand.contract.messages import BASE, PoseStamped
+from support.in_process import ASSUMED, hand
 from thirdhand.contract.records import SIDES, Mode
 from thirdhand.contract.requests import TOLERANCE_M
 from thirdhand.core.controller import Controller
@@ -38,21 +37,12 @@ from thirdhand_sim.teach import via_points_of
 pytestmark = pytest.mark.thorough
 
 PREDICTED = ("target", "target_velocity", "target_acceleration", "covariance", "gate_m")
-ASSUMED = msgspec.structs.replace(
-    Settings(), arm=msgspec.structs.replace(Settings().arm, source="assumed")
-)
 
 
 def of_the_service(skill: Skill, ticks: Iterable[Tick], settings: Settings) -> np.ndarray:
     """The frames of a controller without code of an experiment."""
     controller = Controller(settings, skill, urdf=robot_description(settings))
     return np.array([controller.step(tick) for tick in ticks])
-
-
-def sample(side: str, at: list[float], stamp_ns: int) -> Event:
-    x, y, z = at
-    pose = PoseStamped(stamp_ns, BASE, (x, y, z), (0.0, 0.0, 0.0, 1.0))
-    return Event(f"hands/{side}", cdr.encode_pose(pose), pose)
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +67,7 @@ def wanted(shown: SeenSession, taught: Skill) -> np.ndarray:
             arrives = int(np.ceil(stamp * TRIAL_HZ - 1e-9))
             if arrives < len(inboxes):
                 inboxes[arrives].append(
-                    sample(side, position.tolist(), 1_000_000_000_000 + round(1e9 * float(stamp)))
+                    hand(side, tuple(position.tolist()), 10**12 + round(1e9 * float(stamp)))
                 )
     ticks = [Tick(k, tuple(inbox)) for k, inbox in enumerate(inboxes)]
     return of_the_service(taught, ticks, msgspec.structs.replace(ASSUMED, rate_hz=TRIAL_HZ))
@@ -123,7 +113,7 @@ def test_motion_follows_through_controller() -> None:
         ticks.append(
             Tick(
                 k,
-                tuple(sample(side, part.tolist(), 1_000_000_000_000 + k) for side, part in samples),
+                tuple(hand(side, tuple(part.tolist()), 10**12 + k) for side, part in samples),
             )
         )
     expected = of_the_service(replace(skill, threshold=np.inf), ticks, ASSUMED)[settle:]

@@ -38,10 +38,9 @@ def suffered(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     return result
 
 
-@pytest.mark.parametrize("name", ["tracker frozen"])
-def test_silent_tracker_stops_the_arm(suffered: dict[str, Any], name: str) -> None:
+def test_silent_tracker_stops_the_arm(suffered: dict[str, Any]) -> None:
     """The arm stops when the hands are stale."""
-    fault = suffered["faults"][name]
+    fault = suffered["faults"]["tracker frozen"]
     assert fault["reason"] == "stale_hand"
     assert 80 <= fault["hold_ms"] <= 120
     assert fault["rest_ms"] < 700

@@ -10,19 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from support.demo import SCENE, assert_soldered, soldered
 from support.turning import BEYOND, cell_in, continuous_cell, continuous_urdf, sliding_cell
-from thirdhand.contract.records import Mode
 from thirdhand.daemon.launch import ENGINES
-from thirdhand.recordings.shipped import shipped_skill
 from thirdhand.settings.config import Settings
-from thirdhand.skills.via_points import adapted
 from thirdhand_sim.bench import Bench
 from thirdhand_sim.engines import world_of
-from thirdhand_sim.lab.rehearsal import rehearse
-from thirdhand_sim.scene import Scene
 from thirdhand_sim.script import HandScript
-
-SCENE = Scene()
 
 
 def with_gripper(folder: Path) -> Settings:
@@ -38,24 +32,9 @@ def with_gripper(folder: Path) -> Settings:
 @pytest.mark.one_case
 def test_it_does_the_task(tmp_path: Path, made: Callable[[Path], Settings], engine: str) -> None:
     cell = made(tmp_path)
-    taught = adapted(shipped_skill(), SCENE.via_points(), tolerance=0.001).for_loop()
-    world = world_of(engine)
-    run = rehearse(
-        HandScript(SCENE, seed=1),
-        lambda _: taught,
-        settings=cell,
-        rate_hz=100,
-        keep=True,
-        world=world,
-    )
-    assert run.events.success
-    assert max(run.errors_mm) <= 3.0, run.errors_mm
-    frames = run.frames
-    limits = cell.joints
-    assert (frames["mode"][run.time_s > 0] == Mode.FOLLOW).all()
-    assert (np.abs(frames["joint_velocities"]) <= limits.velocity).all()
-    assert np.abs(run.joints[:, 0] - frames["joints"]).max() < 3e-3
-    assert np.abs(np.diff(frames["joints"], axis=0)).max() < 0.03
+    run = soldered(cell, world=world_of(engine))
+    assert_soldered(run, cell)
+    assert np.abs(np.diff(run.frames["joints"], axis=0)).max() < 0.03
 
 
 @pytest.mark.parametrize("engine", ENGINES)

@@ -230,11 +230,8 @@ def setpoint_speed_is_within_its_limit(session: Session) -> Vector:
 
 def setpoint_is_slow_while_it_engages(session: Session) -> Vector:
     """A setpoint that begins faster than the engage speed may only slow down."""
-    speed = _norms(session.frames["setpoint_velocity"])
-    limit = session.settings.tool.engaging_speed
-    excess = speed[1:] - np.maximum(speed[:-1], limit) * (1.0 + ROUNDING) - ROUNDING
-    engages = session.frames["flags"] & Flag.ENGAGING > 0
-    return _with_first(np.where(_pairs(_following(session)) & engages[1:], excess, 0.0))
+    rise = _rise(session, "setpoint_velocity", session.settings.tool.engaging_speed)
+    return np.where(session.frames["flags"] & Flag.ENGAGING > 0, rise, 0.0)
 
 
 def setpoint_acceleration_is_within_its_limit(session: Session) -> Vector:

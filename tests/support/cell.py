@@ -33,8 +33,9 @@ def thirdhand(
 ) -> subprocess.CompletedProcess[str]:
     """A `thirdhand` command, run to its end."""
     command = [sys.executable, "-m", "thirdhand", *arguments]
+    more = {"cwd": ROOT} | more
     return subprocess.run(
-        command, capture_output=True, text=True, timeout=timeout, check=False, cwd=ROOT, **more
+        command, capture_output=True, text=True, timeout=timeout, check=False, **more
     )
 
 

@@ -5,6 +5,7 @@ the bench that plays them back, each at its own rate.
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import msgspec
@@ -28,9 +29,11 @@ from thirdhand_sim.closed_loop import (
     joints_event,
 )
 from thirdhand_sim.engines import world_of
+from thirdhand_sim.lab.rehearsal import Rehearsed, rehearse
 from thirdhand_sim.network import Commands, Gripper, Led
 from thirdhand_sim.scene import Scene
 from thirdhand_sim.script import HandScript
+from thirdhand_sim.world import World
 
 SCENE = Scene()
 
@@ -66,6 +69,33 @@ class Sample(NamedTuple):
 def taught() -> Skill:
     """The shipped skill with the nominal scene's via-points."""
     return adapted(shipped_skill(), SCENE.via_points(), tolerance=0.001).for_loop()
+
+
+def soldered(
+    cell: Settings | None = None,
+    *,
+    world: type[World] | None = None,
+    look: Callable[[Bench], None] = lambda bench: None,
+) -> Rehearsed:
+    """A run of the nominal scene at 100 Hz, with its arrays."""
+    return rehearse(
+        HandScript(SCENE, seed=1),
+        lambda _: taught(),
+        settings=cell,
+        rate_hz=100,
+        world=world,
+        keep=True,
+        look=look,
+    )
+
+
+def assert_soldered(run: Rehearsed, cell: Settings) -> None:
+    """Assert that a run succeeds within 3 mm, and that the arm follows within its speed limits."""
+    assert run.events.success
+    assert max(run.errors_mm) <= 3.0, run.errors_mm
+    assert (run.frames["mode"][run.time_s > 0] == Mode.FOLLOW).all()
+    assert (np.abs(run.frames["joint_velocities"]) <= cell.joints.velocity).all()
+    assert np.abs(run.joints[:, 0] - run.frames["joints"]).max() < 3e-3
 
 
 def played(settings: Settings, engine: str | None = None, *, bench_hz: int | None = None) -> Played:

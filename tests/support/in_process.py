@@ -6,11 +6,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
 
-from support.wam import JOINT_NAMES
+from support.wam import JOINT_NAMES, URDF
 from thirdhand.contract import cdr
 from thirdhand.contract.messages import GRIPPER, JointState
 from thirdhand.contract.records import SIDES
@@ -116,6 +117,37 @@ def assert_limits_hold(seen: np.ndarray, cell: Settings = ASSUMED) -> None:
     assert (np.abs(np.diff(ddq, axis=0)) / dt <= np.array(limits.jerk) * (1 + 1e-6)).all(), "jerk"
     moved = np.diff(q, axis=0) - 0.5 * dt * (dq[1:] + dq[:-1])
     assert (np.abs(moved) <= 2e-9 + 0.25 * np.array(limits.jerk) * dt**3).all(), "a jump"
+
+
+def record(
+    path: Path,
+    skill: Skill,
+    ticks: Iterable[Tick],
+    *,
+    states_every: int | None = None,
+    change: Callable[[Frame], None] = lambda frame: None,
+    **more: Any,
+) -> Path:
+    """A recording of a cell whose arm does not report its joints, with states and changed frames
+    where they are requested.
+    """
+    controller = Controller(ASSUMED, skill, urdf=URDF)
+    start = controller.state
+    with Recorder(path, settings=ASSUMED, skill=skill.file, state=start, **more) as recorder:
+
+        def write(tick: Tick, frame: Frame) -> None:
+            is_whole = states_every and tick.index % states_every == 0
+            changed = frame.copy()
+            change(changed)
+            recorder.write(
+                tick,
+                changed,
+                time_ns=tick.index * 2_000_000,
+                state=controller.state if is_whole else None,
+            )
+
+        run(controller, ticks, [write])
+    return path
 
 
 class Loop:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +13,16 @@ import rerun as rr
 
 from support.wam import FRAME, JOINT_NAMES, STATE
 from thirdhand.contract import cdr, messages
+from thirdhand.contract.requests import ViaPoint
 from thirdhand.core.controller import outgoing
 from thirdhand.core.frame import TIMING, Event, Record, Tick, blank
+from thirdhand.core.skill.skill import Skill
 from thirdhand.recordings.recording import Recorder, Recording
 from thirdhand.recordings.replay import ticks as ticks_in
+from thirdhand.recordings.steps import Step
 from thirdhand.scribe.scribe import Scribe
 from thirdhand.settings.config import WAM, Settings
+from thirdhand.skills.skill_file import with_file
 from thirdhand.viewer.stream import Viewer
 
 START_NS = 1_700_000_000_000_000_000
@@ -24,6 +30,14 @@ PERIOD_NS = 2_000_000
 SKILL = bytes(range(256)) * 40
 TEXT = "TextLog:text"
 CELL = Settings(cell="hall/bench-1")
+
+
+def vise_taught(skill: Skill) -> bytes:
+    """The file of a skill with a via-point at a vise, which is a ball of 3 cm."""
+    vise = ViaPoint(
+        "vise", (0.62, -0.28, 0.3), (0.98, 0.32, 0.06), (0.54, -0.28, 0.38), radius=0.03
+    )
+    return with_file(replace(skill, via_points=(vise,))).file
 
 
 def at_ns(tick: int) -> int:
@@ -175,6 +189,11 @@ def drawn_ticks(path: Path, curve: str) -> list[int]:
     return ticks
 
 
+def frames_of(path: Path) -> np.ndarray:
+    """The recorded frames of a recording."""
+    return np.array([step.frame for step in Recording.open(path).steps() if step.frame is not None])
+
+
 def values(rows: list[dict[str, Any]], column: str) -> list[Any]:
     """The logged values of a column, in order."""
     return [row[column] for row in rows if row.get(column) is not None]
@@ -189,18 +208,22 @@ def views(container: Any) -> Iterator[Any]:
             yield from views(part)
 
 
+@contextlib.contextmanager
+def copied(
+    old: Recording, path: Path, *, whole: bool = True, **more: Any
+) -> Iterator[tuple[Recorder, Iterator[tuple[Tick, Step]]]]:
+    """A recorder of another recording with the same start, and the ticks and steps to write."""
+    start, *steps = old.steps(whole=whole)
+    common: dict[str, Any] = {"settings": old.settings, "skill": old.skill, "state": start.state}
+    with Recorder(path, **common, **more) as recorder:
+        yield recorder, zip(ticks_in(old), steps, strict=True)
+
+
 def thin(whole: Path, path: Path, *, spoilt: int | None = None) -> Path:
     """A thin copy of a whole recording; the target of one tick may be changed."""
     old = Recording.open(whole)
-    start, *steps = old.steps()
-    more: dict[str, Any] = {
-        "settings": old.settings,
-        "skill": old.skill,
-        "urdf": old.urdf,
-        "thin": True,
-    }
-    with Recorder(path, state=start.state, **more) as recorder:
-        for tick, step in zip(ticks_in(old), steps, strict=True):
+    with copied(old, path, urdf=old.urdf, thin=True) as (recorder, steps):
+        for tick, step in steps:
             assert step.frame is not None
             frame = step.frame.copy()
             frame["target"] += 1e-12 * (tick.index == spoilt)

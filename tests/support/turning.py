@@ -6,10 +6,9 @@ import math
 import re
 from pathlib import Path
 
-from support.paths import ROOT
+from support.paths import ARMS
 from thirdhand.settings.config import Settings, load
 
-ARMS = ROOT / "service" / "thirdhand" / "arms"
 CONTINUOUS = ("shoulder_pan_joint", "wrist_1_joint", "wrist_3_joint")
 # [rad] base joint at the start posture; the task moves it to both sides of pi
 NEAR_SEAM = math.pi - 0.02

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from support.paths import ROOT
+from support.paths import ARMS
 from thirdhand.settings.config import Settings, load
 
-UR5 = (ROOT / "service" / "thirdhand" / "arms" / "ur5.urdf").read_text(encoding="utf-8")
+UR5 = (ARMS / "ur5.urdf").read_text(encoding="utf-8")
 CELL = f"""
 [arm]
 urdf = "arm.urdf"

@@ -222,6 +222,7 @@ def main(address: str, *joints: str) -> None:
     def wait() -> None:
         for _ in sys.stdin:
             robot.is_stopped = not robot.is_stopped
+            print("stopped", flush=True)
         ended.set()
 
     threading.Thread(target=wait, daemon=True).start()

@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from support.cell import LISTENING, Tracker, serving, told
 from support.cell_commands import assert_refused, started, succeeded
-from support.paths import ROOT
+from support.paths import ARMS, ROOT
 from thirdhand.contract import cdr
 from thirdhand.contract.messages import JointState, PoseStamped
 from thirdhand.daemon.launch import free_port
@@ -75,6 +75,13 @@ def held_by(kind: str, *, arm: str = "wam", seed: int = 0) -> HeldTool:
     return held(path_of(arm, seed), TRACKER_KINDS[kind], np.random.default_rng([seed, 1]))
 
 
+def errors_at(
+    corners: np.ndarray, calibration: Calibration, turn: Rotation = TRUE_TURN
+) -> np.ndarray:
+    """The true errors [m] of mapped corners (N, 3)."""
+    return np.linalg.norm(calibration.mapped(turn.inv().apply(corners - ORIGIN)) - corners, axis=1)
+
+
 # --- accuracy -------------------------------------------------------------------------------------
 
 
@@ -97,9 +104,7 @@ def test_a_held_tool_shows_where_the_tracker_is(
             solve_held(tool._replace(hand=tool.hand * (1, 1, -1)), bench_corners(cell_of(arm)))
         errors.append(1e3 * error_m(calibration))
         corners = np.array(calibration.corners)
-        off_m = np.linalg.norm(
-            calibration.mapped(TRUE_TURN.inv().apply(corners - ORIGIN)) - corners, axis=1
-        )
+        off_m = errors_at(corners, calibration)
         shares.append(np.square(off_m / np.array(calibration.corner_std_m)).mean())
         assert np.linalg.norm(np.array(calibration.hand_in_tool) - GRIP) < 1e-3 * worst_mm
         assert (
@@ -142,9 +147,7 @@ def test_a_held_tool_is_within_twice_its_accuracy(seconds: float, seed: int) -> 
         if calibration.std_m > ACCEPT_M:
             continue
         accepted += 1
-        off_m = np.linalg.norm(
-            calibration.mapped(TRUE_TURN.inv().apply(CORNERS - ORIGIN)) - CORNERS, axis=1
-        )
+        off_m = errors_at(CORNERS, calibration)
         assert np.sqrt(np.square(off_m).mean()) < 2.0 * calibration.std_m
     assert accepted >= 1
 
@@ -319,9 +322,7 @@ def test_pose_by_points_is_within_twice_its_accuracy(noise_m: float, missed_m: f
         except CalibrationError:
             continue
         accepted += 1
-        off_m = np.linalg.norm(
-            calibration.mapped(turn.inv().apply(CORNERS - ORIGIN)) - CORNERS, axis=1
-        )
+        off_m = errors_at(CORNERS, calibration, turn)
         assert np.sqrt(np.square(off_m).mean()) < 2.0 * calibration.std_m
     assert accepted >= (25 if missed_m == 0.3 else 70)
 
@@ -646,12 +647,8 @@ def test_a_recording_calibrates_and_checks_a_cell(tmp_path: Path) -> None:
     settings = cell_of("ur5")
     arm = path_of("ur5", 0)
     recording(tmp_path / "led.mcap", held_by("mocap", arm="ur5"), arm.joints, settings)
-    urdf = ROOT / "service" / "thirdhand" / "arms" / "ur5.urdf"
-    text = (
-        (ROOT / "service" / "thirdhand" / "arms" / "ur5.toml")
-        .read_text()
-        .replace('"ur5.urdf"', f'"{urdf}"')
-    )
+    urdf = ARMS / "ur5.urdf"
+    text = (ARMS / "ur5.toml").read_text().replace('"ur5.urdf"', f'"{urdf}"')
     (tmp_path / "cell.toml").write_text(text)
     file = [
         "calibrate",

@@ -5,6 +5,7 @@ daemon receives them, hands out of sight, recentring, and a slow network.
 from __future__ import annotations
 
 import contextlib
+import functools
 import json
 import socket
 import threading
@@ -19,16 +20,17 @@ import zenoh
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from support import headset
-from support.cell import LISTENING, serving, until
+from support import cell, headset
+from support.cell import LISTENING, serving
 from support.chromium import Tab
 from support.page_hands import Heard
-from thirdhand.client import Client, endpoints, open_session
+from thirdhand.client import Client, endpoints
 from thirdhand.contract import cdr
 from thirdhand.contract.messages import PoseStamped
 
 pytestmark = pytest.mark.skipif(bool(lacks := headset.lacking()), reason=lacks)
 TIMEOUT_S = 60.0
+until = functools.partial(cell.until, within_s=TIMEOUT_S)
 MAX_STAMP_ERROR_MS = 5.0
 Array = NDArray[np.float64]
 # Hands that move and turn in all directions, at up to 0.3 m/s and 1.4 rad/s.
@@ -51,10 +53,16 @@ CELL = (
 
 
 @pytest.fixture
-def hearing() -> Iterator[tuple[zenoh.Session, str]]:
-    """A session in the daemon's place, and its endpoint."""
-    with open_session(listen=["tcp/127.0.0.1:0"]) as session:
-        yield session, endpoints(session)[0]
+def heard(listener: zenoh.Session) -> Heard:
+    """The hands that a session in the daemon's place receives."""
+    return Heard(listener)
+
+
+@pytest.fixture
+def served(listener: zenoh.Session, tmp_path: Path) -> Iterator[headset.Served]:
+    """The command that serves the page, connected to that session."""
+    with headset.serving_hands(endpoints(listener)[0], tmp_path) as served:
+        yield served
 
 
 def compared(tab: Tab, heard: list[PoseStamped], side: str) -> tuple[Array, Array, Array]:
@@ -95,59 +103,51 @@ def send_more(tab: Tab, count: int) -> None:
 
 @pytest.mark.thorough
 def test_poses_and_stamps_are_accurate(
-    hearing: tuple[zenoh.Session, str], tmp_path: Path, record_property: Any
+    heard: Heard, served: headset.Served, tmp_path: Path, record_property: Any
 ) -> None:
     """Poses are accurate to a millimetre and a tenth of a degree."""
-    session, endpoint = hearing
-    heard = Heard(session)
-    with headset.serving_hands(endpoint, tmp_path) as served:
-        with headset.worn(served.url, tmp_path) as tab:
-            tab.ask(MOVING)
-            send_more(tab, 20)
-            # Stamps are accurate to half of the shortest round trip: 0.6 ms on an idle machine.
-            tab.until(f"link.isReady && link.clock_ms < {MAX_STAMP_ERROR_MS}")
-            precise_ms = tab.ask("performance.timeOrigin + performance.now()")
-            send_more(tab, 150)
-            bound_ms = tab.ask("link.clock_ms")
-            for side, poses in heard.poses.items():
-                precise = [
-                    pose for pose in poses if pose.stamp_ns / 1e6 > precise_ms + MAX_STAMP_ERROR_MS
-                ]
-                off_m, off_rad, late_s = compared(tab, precise, side)
-                errors = np.array([1e3 * off_m.max(), np.degrees(off_rad.max())])
-                figures = [
-                    *errors.tolist(),
-                    *(1e3 * np.percentile(late_s, (0, 50, 100))).tolist(),
-                    bound_ms,
-                ]
-                record_property(f"{side}: mm, degrees, stamp's error and its bound in ms", figures)
-                assert len(precise) > 100
-                assert {pose.frame_id for pose in precise} == {"webxr"}
-                assert off_m.max() < 0.001
-                assert off_rad.max() < np.radians(0.1)
-                assert 1e3 * np.abs(late_s).max() < MAX_STAMP_ERROR_MS
-                assert (np.diff([pose.stamp_ns for pose in precise]) > 0).all()
-        served.end()
-        assert served.counts()[0] >= 170
+    with headset.worn(served.url, tmp_path) as tab:
+        tab.ask(MOVING)
+        send_more(tab, 20)
+        # Stamps are accurate to half of the shortest round trip: 0.6 ms on an idle machine.
+        tab.until(f"link.isReady && link.clock_ms < {MAX_STAMP_ERROR_MS}")
+        precise_ms = tab.ask("performance.timeOrigin + performance.now()")
+        send_more(tab, 150)
+        bound_ms = tab.ask("link.clock_ms")
+        for side, poses in heard.poses.items():
+            precise = [
+                pose for pose in poses if pose.stamp_ns / 1e6 > precise_ms + MAX_STAMP_ERROR_MS
+            ]
+            off_m, off_rad, late_s = compared(tab, precise, side)
+            errors = np.array([1e3 * off_m.max(), np.degrees(off_rad.max())])
+            figures = [
+                *errors.tolist(),
+                *(1e3 * np.percentile(late_s, (0, 50, 100))).tolist(),
+                bound_ms,
+            ]
+            record_property(f"{side}: mm, degrees, stamp's error and its bound in ms", figures)
+            assert len(precise) > 100
+            assert {pose.frame_id for pose in precise} == {"webxr"}
+            assert off_m.max() < 0.001
+            assert off_rad.max() < np.radians(0.1)
+            assert 1e3 * np.abs(late_s).max() < MAX_STAMP_ERROR_MS
+            assert (np.diff([pose.stamp_ns for pose in precise]) > 0).all()
+    served.end()
+    assert served.counts()[0] >= 170
 
 
 def test_a_hand_out_of_sight_is_not_sent_and_the_other_one_is(
-    hearing: tuple[zenoh.Session, str], tmp_path: Path
+    heard: Heard, served: headset.Served, tmp_path: Path
 ) -> None:
-    session, endpoint = hearing
-    heard = Heard(session)
-    with (
-        headset.serving_hands(endpoint, tmp_path) as served,
-        headset.worn(served.url, tmp_path) as tab,
-    ):
+    with headset.worn(served.url, tmp_path) as tab:
         tab.ask(STILL)
-        until(lambda: heard.poses["left"] and heard.poses["right"], within_s=TIMEOUT_S)
+        until(lambda: heard.poses["left"] and heard.poses["right"])
         tab.ask("device.hands.left.connected = false")
         tab.until("!seen.left && !!seen.right")
         time.sleep(0.3)
         before = {side: len(poses) for side, poses in heard.poses.items()}
         send_more(tab, 10)
-        until(lambda: len(heard.poses["right"]) >= before["right"] + 10, within_s=TIMEOUT_S)
+        until(lambda: len(heard.poses["right"]) >= before["right"] + 10)
         assert len(heard.poses["left"]) == before["left"]
         tab.ask("device.hands.right.connected = false")
         tab.until("!seen.right")
@@ -156,38 +156,33 @@ def test_a_hand_out_of_sight_is_not_sent_and_the_other_one_is(
         time.sleep(0.5)
         assert sent(tab) == count
         tab.ask("device.hands.left.connected = true")
-        until(lambda: len(heard.poses["left"]) > before["left"], within_s=TIMEOUT_S)
+        until(lambda: len(heard.poses["left"]) > before["left"])
 
 
 @pytest.mark.parametrize("side", ["right", "left"])
 def test_a_phone_is_one_hand_and_a_touch_its_pinch(
-    side: str, hearing: tuple[zenoh.Session, str], tmp_path: Path
+    side: str, heard: Heard, listener: zenoh.Session, tmp_path: Path
 ) -> None:
-    session, endpoint = hearing
-    heard = Heard(session)
     clutch: list[bool] = []
-    subscriber = session.declare_subscriber(
+    subscriber = listener.declare_subscriber(
         "thirdhand/clutch", lambda sample: clutch.append(bool(sample.payload.to_bytes()[-1]))
     )
     phone = {"without": ("hand-tracking",), "is_phone": True}
     with (
-        headset.serving_hands(endpoint, tmp_path, "--pinch-clutch", side) as served,
+        headset.serving_hands(endpoints(listener)[0], tmp_path, "--pinch-clutch", side) as served,
         headset.worn(f"{served.url}&hand={side}", tmp_path, **phone) as tab,
     ):
         tab.ask("device.position.set(.1, 1.2, -.3), device.quaternion.set(0, .6, 0, .8)")
         position = (0.1, 1.2, -0.3)
-        until(
-            lambda: heard.poses[side] and np.allclose(heard.poses[side][-1].position, position),
-            within_s=TIMEOUT_S,
-        )
+        until(lambda: heard.poses[side] and np.allclose(heard.poses[side][-1].position, position))
         assert np.allclose(heard.poses[side][-1].orientation, (0.0, 0.6, 0.0, 0.8))
         assert heard.poses["left" if side == "right" else "right"] == []
         tab.until(f"document.getElementById('sent').textContent.includes('{side} seen')")
         assert clutch[-1] is False
         tab.ask("device.controllers.right.updateButtonValue('trigger', 1)")
-        until(lambda: clutch[-1], within_s=TIMEOUT_S)
+        until(lambda: clutch[-1])
         tab.ask("device.controllers.right.updateButtonValue('trigger', 0)")
-        until(lambda: not clutch[-1], within_s=TIMEOUT_S)
+        until(lambda: not clutch[-1])
     subscriber.undeclare()
 
 
@@ -209,7 +204,7 @@ def test_controller_leads_the_tool_while_its_trigger_is_pressed(tmp_path: Path) 
         tab.ask("device.primaryInputMode = 'controller'")
         tab.ask(place.format(1.0))
         daemon.until(lambda now: now["reason"] == "no_wish", TIMEOUT_S)
-        until(lambda: setpoints, within_s=TIMEOUT_S)
+        until(lambda: setpoints)
         began = setpoints[-1]
         tab.ask("device.controllers.right.updateButtonValue('trigger', 1)")
         daemon.until(lambda now: now["mode"] == "follow", TIMEOUT_S)
@@ -220,32 +215,24 @@ def test_controller_leads_the_tool_while_its_trigger_is_pressed(tmp_path: Path) 
         tab.ask("device.controllers.right.quaternion.set({}, {}, {}, {})".format(*turn.as_quat()))
         up = (0.0, 0.0, 0.08)  # y of the headset is z of the base
         until(
-            lambda: np.allclose(
-                np.subtract(setpoints[-1].position, began.position), up, atol=0.003
-            ),
-            within_s=TIMEOUT_S,
+            lambda: np.allclose(np.subtract(setpoints[-1].position, began.position), up, atol=0.003)
         )
 
         def turned() -> float:
             now = Rotation.from_quat(setpoints[-1].orientation)
             return float((now * Rotation.from_quat(began.orientation).inv()).as_rotvec()[2])
 
-        until(lambda: abs(turned() - 0.2) < 0.02, within_s=TIMEOUT_S)
+        until(lambda: abs(turned() - 0.2) < 0.02)
         tab.ask("device.controllers.right.updateButtonValue('trigger', 0)")
         daemon.until(lambda now: now["reason"] == "stale_wish", TIMEOUT_S)
         subscriber.undeclare()
 
 
 def test_a_headset_without_hand_tracking_does_not_start(
-    hearing: tuple[zenoh.Session, str], tmp_path: Path
+    heard: Heard, served: headset.Served, tmp_path: Path
 ) -> None:
     """Its own pose is no hand."""
-    session, endpoint = hearing
-    heard = Heard(session)
-    with (
-        headset.serving_hands(endpoint, tmp_path) as served,
-        headset.shown(served.url, tmp_path, without=("hand-tracking",)) as tab,
-    ):
+    with headset.shown(served.url, tmp_path, without=("hand-tracking",)) as tab:
         tab.until("note.includes('hand tracking is missing')")
         assert tab.ask("session === null")
     assert heard.poses == {"left": [], "right": []}
@@ -282,29 +269,26 @@ class Stalling:
 
 
 @pytest.mark.thorough
-def test_late_hands_are_dropped(hearing: tuple[zenoh.Session, str], tmp_path: Path) -> None:
+def test_late_hands_are_dropped(heard: Heard, served: headset.Served, tmp_path: Path) -> None:
     """The network is slow; no hand arrives late."""
-    session, endpoint = hearing
-    heard = Heard(session)
-    with headset.serving_hands(endpoint, tmp_path) as served:
-        port = served.url.split(":")[2].split("/")[0]
-        with (
-            contextlib.closing(Stalling(int(port))) as network,
-            headset.worn(served.url.replace(port, str(network.port)), tmp_path) as tab,
-        ):
-            tab.ask(STILL)
-            send_more(tab, 10)
-            network.flows.clear()
-            tab.until("link.dropped > 10")  # after the first dropped message, none is sent
-            stalled = sent(tab)
-            time.sleep(0.5)
-            assert sent(tab) == stalled
-            network.flows.set()
-            send_more(tab, 10)
-            time.sleep(0.3)
-            dropped = int(tab.ask("link.dropped"))
-        served.end()
-        _, lost, late = served.counts()
+    port = served.url.split(":")[2].split("/")[0]
+    with (
+        contextlib.closing(Stalling(int(port))) as network,
+        headset.worn(served.url.replace(port, str(network.port)), tmp_path) as tab,
+    ):
+        tab.ask(STILL)
+        send_more(tab, 10)
+        network.flows.clear()
+        tab.until("link.dropped > 10")  # after the first dropped message, none is sent
+        stalled = sent(tab)
+        time.sleep(0.5)
+        assert sent(tab) == stalled
+        network.flows.set()
+        send_more(tab, 10)
+        time.sleep(0.3)
+        dropped = int(tab.ask("link.dropped"))
+    served.end()
+    _, lost, late = served.counts()
     assert lost >= dropped - 1  # the last messages may have no successor
     assert late > 0  # messages in transit during the stall
     ages_s = [

@@ -4,6 +4,7 @@ joints, rest ends a take and is left out, and takes are shown, trimmed and delet
 
 from __future__ import annotations
 
+import contextlib
 import re
 import struct
 import threading
@@ -52,13 +53,15 @@ NOTHING = {"until": "key", "rest_s": 1.0, "is_ended": lambda: False, "longest_s"
 
 
 @pytest.fixture(scope="module")
-def sessions() -> Iterator[tuple[zenoh.Session, zenoh.Session]]:
+def sessions(listener: zenoh.Session) -> Iterator[tuple[zenoh.Session, zenoh.Session]]:
     """A session that receives, and a connected session that publishes."""
-    with (
-        open_session(listen=["tcp/127.0.0.1:0"]) as hearing,
-        open_session(connect=endpoints(hearing)) as sender,
-    ):
-        yield hearing, sender
+    with open_session(connect=endpoints(listener)) as sender:
+        yield listener, sender
+
+
+def encoded(stamp_ns: int, frame: str, *position: float) -> bytes:
+    """A message of an unturned pose."""
+    return cdr.encode_pose(PoseStamped(stamp_ns, frame, position, (0.0, 0.0, 0.0, 1.0)))  # type: ignore[arg-type]
 
 
 def heard(taken: Capture, count: int) -> None:
@@ -83,20 +86,14 @@ def test_a_take_holds_what_came_and_the_tool_by_the_joints(
     for i in range(30):
         stamp = 10**18 + i * 10_000_000
         for side, y in (("left", -300.0), ("right", 300.0)):
-            sent.append(
-                cdr.encode_pose(
-                    PoseStamped(stamp, "tracker", (10.0 * i, y, 0.0), (0.0, 0.0, 0.0, 1.0))
-                )
-            )
+            sent.append(encoded(stamp, "tracker", 10.0 * i, y, 0.0))
             publishers[f"hands/{side}"].put(sent[-1])
         state = JointState(stamp, SETTINGS.joints.names, tuple((joints + 0.01 * i).tolist()), ())
         publishers[JOINT_STATES].put(cdr.encode_joints(state))
         heard(taken, 3 * (i + 1))
     unstamped = (0.5, -0.3, 0.2, 0.0, 0.0, 0.0, 1.0)
     publishers["hands/left"].put(cdr.CDR_HEADER + struct.pack("<7d", *unstamped))
-    publishers["hands/left"].put(
-        cdr.encode_pose(PoseStamped(0, "", (float("nan"), 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)))
-    )
+    publishers["hands/left"].put(encoded(0, "", float("nan"), 0.0, 0.0))
     heard(taken, 92)
     taken.close()
     assert taken.malformed == {"hands/left": 2}
@@ -138,18 +135,24 @@ def test_what_is_not_heard_is_named(
     assert list(tmp_path.iterdir()) == []
 
 
-def put_until(
-    told: zenoh.Session, poses: dict[str, tuple[float, float, float]], over: threading.Event
-) -> None:
-    """Publish positions by key, again and again, with the time as stamp."""
+@contextlib.contextmanager
+def published(told: zenoh.Session, poses: dict[str, tuple[float, float, float]]) -> Iterator[None]:
+    """A context in which positions are published by key again and again, stamped with the time."""
+    over = threading.Event()
     publishers = {key: told.declare_publisher(key) for key in poses}
-    for _ in range(2000):
-        for key, position in poses.items():
-            publishers[key].put(
-                cdr.encode_pose(PoseStamped(time.time_ns(), "base", position, (0.0, 0.0, 0.0, 1.0)))
-            )
-        if over.wait(0.01):
-            break
+
+    def publish() -> None:
+        while not over.wait(0.01):
+            for key, position in poses.items():
+                publishers[key].put(encoded(time.time_ns(), "base", *position))
+
+    tracker = threading.Thread(target=publish)
+    tracker.start()
+    try:
+        yield
+    finally:
+        over.set()
+        tracker.join(10)
 
 
 @pytest.mark.parametrize(
@@ -182,29 +185,19 @@ def test_unsuitable_streams_are_reported_before_recording(
     sessions: tuple[zenoh.Session, zenoh.Session], poses: dict[str, Any], wait_s: float, words: str
 ) -> None:
     """The streams are published in an unsuitable form."""
-    over = threading.Event()
-    tracker = threading.Thread(target=put_until, args=(sessions[1], poses, over))
-    tracker.start()
-    try:
-        with pytest.raises(CaptureError, match=words):
-            capture(sessions[0], "bench", Settings(), wait_s=wait_s, **NOTHING)  # type: ignore[arg-type]
-    finally:
-        over.set()
-        tracker.join(10)
+    with published(sessions[1], poses), pytest.raises(CaptureError, match=words):
+        capture(sessions[0], "bench", Settings(), wait_s=wait_s, **NOTHING)  # type: ignore[arg-type]
 
 
 def test_a_take_that_a_request_begins_tells_when(
     sessions: tuple[zenoh.Session, zenoh.Session], tmp_path: Path
 ) -> None:
     """It is told of a rest before the motion, after cutting, and in a take that is written."""
-    over = threading.Event()
     poses = {f"bench/{key}": (0.1, 0.2, 0.3) for key in ("hands/left", "hands/right", "tool/pose")}
-    tracker = threading.Thread(target=put_until, args=(sessions[1], poses, over))
-    tracker.start()
     since_s = time.monotonic()
     asked = iter([False] * 10 + [True] * 100)
     lines: list[str] = []
-    try:
+    with published(sessions[1], poses):
         taken = capture(
             sessions[0],
             "bench",
@@ -217,9 +210,6 @@ def test_a_take_that_a_request_begins_tells_when(
             is_begun=lambda: next(asked),
             say=lines.append,
         )
-    finally:
-        over.set()
-        tracker.join(10)
     assert lines[1].startswith("hands and tool arrive: Enter begins the take")
     path = tmp_path / "take.mcap"
     taken.write(path)
@@ -249,16 +239,8 @@ def test_take_too_far_away_says_where_and_in_which_unit(
             ("tool/pose", *tool),
         ):
             taken.samples[key] = [
-                Sample(
-                    10**18 + i * 10**7,
-                    cdr.encode_pose(
-                        PoseStamped(
-                            10**18 + i * 10**7, frame, (0.3 * scale, 0.0, 0.0), (0, 0, 0, 1.0)
-                        )
-                    ),
-                    np.zeros(3),
-                )
-                for i in range(9)
+                Sample(stamp, encoded(stamp, frame, 0.3 * scale, 0.0, 0.0), np.zeros(3))
+                for stamp in range(10**18, 10**18 + 9 * 10**7, 10**7)
             ]
         taken.write(path)
 
@@ -296,7 +278,7 @@ def test_pose_in_an_unknown_frame_ends_the_take_early(
     for hands, refused in ((HandSettings(), True), (HandSettings(frame="camera"), False)):
         taken = Capture(sessions[0], "bench", Settings(hands=hands))
         taken.close()
-        pose = cdr.encode_pose(PoseStamped(10**18, "camera", (0.3, 0.0, 0.0), (0, 0, 0, 1.0)))
+        pose = encoded(10**18, "camera", 0.3, 0.0, 0.0)
         taken.samples[key] = [Sample(10**18, pose, np.zeros(3))]
         if refused:
             words = (
@@ -412,13 +394,8 @@ def test_a_hand_that_conducts_alone_is_taken_without_the_other(
     assert taken.missing == [f"hands/{who}", "tool/pose or joints/state"]
     for i in range(20):
         for key in ("hands/left", "hands/right", "tool/pose"):
-            position = (0.01 * i, 0.0, 0.5)
-            sender.put(
-                f"alone/{key}",
-                cdr.encode_pose(
-                    PoseStamped(10**18 + i * 10**7, "base", position, (0.0, 0.0, 0.0, 1.0))
-                ),
-            )
+            message = encoded(10**18 + i * 10**7, "base", 0.01 * i, 0.0, 0.5)
+            sender.put(f"alone/{key}", message)
         heard(taken, 2 * (i + 1))
     taken.close()
     taken.write(tmp_path / "a.mcap")

@@ -15,6 +15,7 @@ from urllib.parse import urlsplit
 
 import pytest
 
+from support.cell import until
 from support.recorded import drawn, ticks, values
 from thirdhand.scribe.process import LiveView
 from thirdhand.scribe.protocol import TickMessage
@@ -47,11 +48,7 @@ class Fed:
         self.view = LiveView(lambda: Viewer(urdf=WAM, settings=Settings(), live_port=0))
         self.view.is_paused = False
         self.last = 0
-        until = time.monotonic() + TIMEOUT_S
-        while not self.view.url:
-            assert time.monotonic() < until
-            time.sleep(0.01)
-        self.url = self.view.url
+        self.url = until(lambda: self.view.url, within_s=TIMEOUT_S)
         self._ticks = ticks(1_000_000)
 
     def feed(self, scene_s: float) -> None:
@@ -93,10 +90,7 @@ def program(url: str, file: Path) -> Iterator[subprocess.Popen[bytes]]:
 def stopped(url: str, file: Path) -> Iterator[None]:
     """Rerun's program, stopped once it receives."""
     with program(url, file) as viewer:
-        until = time.monotonic() + TIMEOUT_S
-        while not (file.is_file() and file.stat().st_size > 10_000):
-            assert time.monotonic() < until
-            time.sleep(0.1)
+        until(lambda: file.is_file() and file.stat().st_size > 10_000, within_s=TIMEOUT_S)
         viewer.send_signal(signal.SIGSTOP)
         yield
 
@@ -112,11 +106,11 @@ def test_memory_is_bounded_beside_stopped_viewers(tmp_path: Path) -> None:
         assert resident_mb() - before_mb < BOUND_MB
     connected = fed.last
     with program(fed.url, tmp_path / "later.rrd") as viewer:
-        until = time.monotonic() + TIMEOUT_S
+        end_s = time.monotonic() + TIMEOUT_S
         newest_tick = -1
         while newest_tick <= connected:
             assert viewer.poll() is None
-            assert time.monotonic() < until
+            assert time.monotonic() < end_s
             fed.feed(4.0)
             # the file may be empty, or end within a message
             with contextlib.suppress(OSError, KeyError, RuntimeError):

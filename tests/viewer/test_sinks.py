@@ -5,25 +5,23 @@ from __future__ import annotations
 import re
 import socket
 from collections import Counter
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from support.recorded import TEXT, at_ns, drawn, ticks, values, viewed, write
+from support.recorded import TEXT, at_ns, drawn, ticks, values, viewed, vise_taught, write
 from support.wam import JOINT_NAMES
 from thirdhand.command_line import main
 from thirdhand.contract import cdr
 from thirdhand.contract.messages import JointState, SceneObject
-from thirdhand.contract.requests import ViaPoint, encode_json
+from thirdhand.contract.requests import encode_json
 from thirdhand.core.frame import Record
 from thirdhand.core.skill.model import REGION_95
 from thirdhand.core.skill.pose import CLOSED
 from thirdhand.core.skill.skill import Skill
 from thirdhand.settings.config import WAM, Settings
-from thirdhand.skills.skill_file import with_file
 from thirdhand.viewer.sentences import sentence
 from thirdhand.viewer.stream import Viewer, ViewerError
 from thirdhand.workbench.cli.view import convert
@@ -40,17 +38,16 @@ def test_recording_becomes_a_drawing_with_every_tick(tmp_path: Path) -> None:
     entries = write(tmp_path / "a.mcap", 1200)
     assert convert(tmp_path / "a.mcap", tmp_path / "a.rrd") == 1200
     rows = drawn(tmp_path / "a.rrd")
-    position = [row for row in rows["/joints/position"] if "tick" in row]
-    assert [row["tick"] for row in position] == list(range(1200))
-    assert [row["Scalars:scalars"] for row in position] == [
+    position = rows["/joints/position"]
+    assert values(position, "tick") == list(range(1200))
+    assert values(position, "Scalars:scalars") == [
         frame["joints"].tolist() for _, frame, _ in entries
     ]
-    assert np.datetime64(position[-1]["time"], "ns") == np.datetime64(at_ns(1199), "ns")
-    names = next(
-        row["SeriesLines:names"] for row in rows["/joints/position"] if row.get("SeriesLines:names")
-    )
+    last = values(position, "time")[-1]
+    assert np.datetime64(last, "ns") == np.datetime64(at_ns(1199), "ns")
+    (names,) = values(position, "SeriesLines:names")
     assert len(names) == len(JOINT_NAMES)
-    work = [row["Scalars:scalars"][0] for row in rows["/timing/work"] if "tick" in row]
+    work = np.ravel(values(rows["/timing/work"], "Scalars:scalars"))
     assert work == pytest.approx([timing["work_us"] for *_, timing in entries])
 
 
@@ -63,10 +60,7 @@ def test_hands_and_target_are_drawn_once_they_are_known(tmp_path: Path) -> None:
             one.log("handover taught", "INFO", at_ns(k))
 
     rows = viewed(tmp_path / "a.rrd", 600, change)
-    by_path = {
-        path: [row["tick"] for row in table if row.get("tick") is not None]
-        for path, table in rows.items()
-    }
+    by_path = {path: values(table, "tick") for path, table in rows.items()}
     every = list(range(0, 600, 5))
     assert by_path["/scene/tool"] == by_path["/arm/joints/3"] == every
     assert (
@@ -75,18 +69,14 @@ def test_hands_and_target_are_drawn_once_they_are_known(tmp_path: Path) -> None:
         == [tick for tick in every if tick >= 10]
     )
     assert len(by_path["/scene/tool_trail"]) == 600 // 25 - 1
-    assert [row["Points3D:positions"][0] for row in rows["/scene/left_hand"] if "tick" in row][
-        -1
-    ] == pytest.approx(entries[595][1]["hands"][0])
-    half = [row["Ellipsoids3D:half_sizes"][0] for row in rows["/scene/target"] if "tick" in row][-1]
+    (position,) = values(rows["/scene/left_hand"], "Points3D:positions")[-1]
+    assert position == pytest.approx(entries[595][1]["hands"][0])
+    (half,) = values(rows["/scene/target"], "Ellipsoids3D:half_sizes")[-1]
     assert sorted(half) == pytest.approx(
         sorted(np.sqrt(REGION_95 * np.array([4e-4, 1e-4, 2e-4]))), rel=1e-4
     )
-    assert [row["StateChange:state"] for row in rows["/mode"] if row.get("tick") is not None] == [
-        ["hold"],
-        ["follow"],
-    ]
-    assert Counter(row["TextLog:text"][0] for row in rows["/log"]) == {
+    assert values(rows["/mode"], "StateChange:state") == [["hold"], ["follow"]]
+    assert Counter(text for (text,) in values(rows["/log"], TEXT)) == {
         "hold: no hands yet: a hand has not been seen since the start": 1,
         "follow": 1,
         "handover taught": 1,
@@ -147,10 +137,7 @@ def test_the_measured_arm_is_drawn_beside_the_commanded_one(tmp_path: Path) -> N
 
 def test_shipped_skill_is_drawn_with_demonstrations(tmp_path: Path, skill: Skill) -> None:
     """The skill's via-points are drawn too."""
-    point = ViaPoint(
-        "vise", (0.62, -0.28, 0.3), (0.98, 0.32, 0.06), (0.54, -0.28, 0.38), radius=0.03
-    )
-    taught = with_file(replace(skill, via_points=(point,))).file
+    taught = vise_taught(skill)
     rows = viewed(
         tmp_path / "a.rrd",
         40,

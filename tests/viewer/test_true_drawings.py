@@ -4,27 +4,23 @@ gaps of the recording are gaps of curves and trails.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from support.recorded import SKILL, TEXT, at_ns, drawn, ticks, values
+from support.recorded import SKILL, TEXT, at_ns, drawn, frames_of, ticks, values, vise_taught
 from support.wam import JOINT_NAMES
 from thirdhand.contract import cdr
 from thirdhand.contract.messages import JointState
 from thirdhand.contract.records import Mode, Reason
-from thirdhand.contract.requests import ViaPoint
 from thirdhand.core.frame import Event, Tick
 from thirdhand.core.skill.skill import Skill
-from thirdhand.recordings.recording import Recorder, Recording
+from thirdhand.recordings.recording import Recorder
 from thirdhand.settings.config import Settings
-from thirdhand.skills.skill_file import with_file
 from thirdhand.workbench.cli.view import convert
 
-VISE = ViaPoint("vise", (0.62, -0.28, 0.3), (0.98, 0.32, 0.06), (0.54, -0.28, 0.38), radius=0.03)
 # ticks between those of whole frames
 MEASURED_AT = 55
 TAUGHT_AT = 155
@@ -39,7 +35,7 @@ def log_of(rows: dict[str, list[dict[str, Any]]]) -> dict[str, float]:
 
 def test_drawing_shows_what_is_between_whole_frames(tmp_path: Path, skill: Skill) -> None:
     """Events and late ticks between whole frames are shown."""
-    taught = with_file(replace(skill, via_points=(VISE,))).file
+    taught = vise_taught(skill)
     with Recorder(
         tmp_path / "a.mcap", settings=Settings(), skill=skill.file, thin=True
     ) as recorder:
@@ -60,9 +56,7 @@ def test_drawing_shows_what_is_between_whole_frames(tmp_path: Path, skill: Skill
             )
         recorder.note("requests", 'via_points {"op": "clear"}', at_ns(450))
     assert convert(tmp_path / "a.mcap", tmp_path / "a.rrd") == 400
-    whole = [
-        step.tick for step in Recording.open(tmp_path / "a.mcap").steps() if step.frame is not None
-    ]
+    whole = frames_of(tmp_path / "a.mcap")["tick"].tolist()
     rows = drawn(tmp_path / "a.rrd")
     assert values(rows["/joints/position"], "tick") == whole
     assert {0, HELD_AT, HELD_AT + 1} < set(whole)
