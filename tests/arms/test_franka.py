@@ -88,19 +88,20 @@ def test_it_follows_within_its_limits_where_it_is_told_to_be(
     with robot(tmp_path, "--fast") as device:
         arm = franka.FrankaArm(cell(), device.address)
         playback = Playback(
-            arm.limits, arm.stands_at(), period_s=arm.period_s, speed_limits=arm.speed_limits
+            arm.limits, arm.measured()[0], period_s=arm.period_s, speed_limits=arm.speed_limits
         )
         with arm:
             while passed_s < 6.3:
-                now = arm.read()
-                passed_s += now.elapsed_s
+                elapsed_s = arm.wait()
+                joints, _ = arm.measured()
+                passed_s += elapsed_s
                 came = []
                 while index < len(arriving) and arriving[index][0] <= passed_s:
                     came.append(arriving[index][1])
                     index += 1
-                measured.append((passed_s, now.position))
-                moved = playback.step(came, measured=now.position, elapsed_s=now.elapsed_s)
-                arm.write(moved.position, moved.velocity)
+                measured.append((passed_s, joints))
+                moved = playback.step(came, measured=joints, elapsed_s=elapsed_s)
+                arm.lead(moved)
     assert playback.refused == 0
     assert device.new.mean() > 0.999
     assert_allowed(device.velocity, device.joints)
