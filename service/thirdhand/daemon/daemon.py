@@ -235,9 +235,9 @@ class Daemon:
         )
         for key, payload in outputs:
             cell.streams.publish(key, payload, attachment)
+        timing = cell.times.end(frame, cell.clock)
         cell.core.settle()
         cell.frame = frame
-        timing = cell.times.end(frame, cell.clock)
         cell.scribe.send(
             tick,
             frame,

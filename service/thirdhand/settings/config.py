@@ -371,7 +371,7 @@ class RecordingSettings(Section, frozen=True):
 class LoopSettings(Section, frozen=True):
     """The loop's use of the processor."""
 
-    # rehearse each tick before its deadline, which shortens it and takes 6 % of a core
+    # rehearse each tick before its deadline, which shortens it and takes 5 % of a core
     prepare: bool = True
     # no processor sleeps while the service runs: more power, shorter latency
     awake: bool = False
