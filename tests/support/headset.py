@@ -12,6 +12,7 @@ import signal
 import subprocess
 import sys
 import tarfile
+import tempfile
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -99,20 +100,22 @@ def _fetch() -> None:
     if _script().exists():
         return
     CACHE.mkdir(parents=True, exist_ok=True)
-    fetched = subprocess.run(
-        ["npm", "pack", "--silent", f"iwer@{IWER}"],
-        cwd=CACHE,
-        check=True,
-        timeout=60,
-        capture_output=True,
-        text=True,
-    )
-    with tarfile.open(CACHE / fetched.stdout.split()[-1]) as package:
-        script = package.extractfile("package/build/iwer.min.js")
-        assert script is not None
-        partial = _script().with_suffix(f".{os.getpid()}")
-        partial.write_bytes(script.read())
-    partial.replace(_script())
+    # other workers may fetch it at the same time
+    with tempfile.TemporaryDirectory(dir=CACHE) as folder:
+        fetched = subprocess.run(
+            ["npm", "pack", "--silent", f"iwer@{IWER}"],
+            cwd=folder,
+            check=True,
+            timeout=60,
+            capture_output=True,
+            text=True,
+        )
+        with tarfile.open(Path(folder) / fetched.stdout.split()[-1]) as package:
+            script = package.extractfile("package/build/iwer.min.js")
+            assert script is not None
+            partial = Path(folder) / "iwer.min.js"
+            partial.write_bytes(script.read())
+        partial.replace(_script())
 
 
 def emulation(
