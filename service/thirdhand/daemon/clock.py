@@ -34,8 +34,8 @@ DRAW = 256  # [deadlines] time constant with which stamps follow a smaller diffe
 CREEP_NS = 1_000  # stamps grow by this per deadline while the system clock is behind
 _LOCK_TOUCHED_PAGES = 1 | 2 | 4  # MCL_CURRENT, MCL_FUTURE and MCL_ONFAULT of Linux
 FIFO_PRIORITY = 80  # priority of the loop
-AWAKE = "/dev/cpu_dma_latency"  # Linux's file for the latency that idle processors may have [µs]
 BESIDE_PRIORITY = 10  # priority of threads that may hold the interpreter lock
+AWAKE = "/dev/cpu_dma_latency"  # Linux's file for the latency that idle processors may have [µs]
 MAX_LATENCY_MS = 1000.0  # a longer latency shows that the clocks differ
 _PLACE_OF_STAGE = {stage: place for place, stage in enumerate(STAGES)}
 
@@ -46,7 +46,7 @@ class Deadlines:
     Missed deadlines are skipped and counted; there is no burst to make up for them. `stamp_ns` is
     the time of the newest deadline on the system clock [ns], and always grows. It advances by whole
     periods and follows the system clock slowly. If the clock was set ahead, the next stamp follows;
-    if it was set back, `stamp_ns` grows by CREEP_NS per deadline until the clock has passed it.
+    if it was set back, stamps grow by CREEP_NS per deadline until the clock has passed them.
     """
 
     def __init__(

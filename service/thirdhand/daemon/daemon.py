@@ -69,7 +69,7 @@ class Daemon:
         """`skills` is the folder from which clients load skills."""
         self._cell = cell
         self._received: list[Event] = []  # the messages for the next tick that came before it
-        self._is_in_tick = False
+        self._tick_is_open = False  # from its deadline until it is recorded
         self._failed_at: int | None = None  # tick of the loop's last failure
 
         # Threads beside the loop make the status and answer requests.
@@ -133,9 +133,9 @@ class Daemon:
         failure.
         """
         cell = self._cell
-        if self._is_in_tick:  # else it failed before the deadline, so that no tick is lost
+        if self._tick_is_open:  # else it failed before the deadline, so that no tick is lost
             cell.scribe.skip()
-            self._is_in_tick = False
+            self._tick_is_open = False
         cell.inbox.answer(None)
         self._received = []  # one of them may be the cause
         tick = int(cell.frame["tick"])
@@ -177,7 +177,7 @@ class Daemon:
         cell = self._cell
         for tick in self._ticks():
             self._publish(cell.core.decide(tick, cell.times.lap))
-            self._is_in_tick = False
+            self._tick_is_open = False
 
     def _ticks(self) -> Iterator[Tick]:
         """A tick at each deadline, with what arrived until then. After `stop`, each tick orders a
@@ -191,7 +191,7 @@ class Daemon:
         prepare = self._rehearse if has_time and cell.settings.loop.prepare else None
         while True:
             index, late_ns = cell.clock.wait(prepare)
-            self._is_in_tick = True
+            self._tick_is_open = True
             cell.times.begin(late_ns)
             if cell.stop.is_set():
                 if stop_by is None:
