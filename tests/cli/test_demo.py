@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import json
 import sys
-import threading
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,7 @@ from support.cell import thirdhand
 from support.cell_commands import succeeded
 from support.paths import ROOT
 from support.recorded import drawn_ticks, frames_of
+from support.repeated import repeated
 from thirdhand.client import Client, Tracker, UnreachableError, open_session
 from thirdhand.command_line import main
 from thirdhand.contract.records import Mode, Reason
@@ -133,7 +133,6 @@ def test_the_service_ends_before_the_arm_that_it_moves(tmp_path: Path) -> None:
     them.
     """
     settings = Settings(rate_hz=100)
-    stop = threading.Event()
     ends = list[tuple[str, int]]()
     with (
         launched(tmp_path, "--joints", "state", settings=settings, record=tmp_path) as service,
@@ -142,20 +141,14 @@ def test_the_service_ends_before_the_arm_that_it_moves(tmp_path: Path) -> None:
     ):
 
         def hold_still() -> None:
-            while not stop.wait(0.01):
-                for side, start in (("left", Scene().left_start), ("right", Scene().right_start)):
-                    tracker.publish(side, start)
+            for side, start in (("left", Scene().left_start), ("right", Scene().right_start)):
+                tracker.publish(side, start)
 
         def end() -> None:
             ends.append((Client(session).status().mode, service.stop()))
 
-        person = threading.Thread(target=hold_still)
-        person.start()
-        try:
+        with repeated(hold_still):
             assert played(service.endpoint, "--tracked-hands", "1", reported=end)
-        finally:
-            stop.set()
-            person.join()
     assert ends == [("follow", 0)]
     (recording,) = tmp_path.glob("*.mcap")
     frames = read(Recording.open(recording)).frames

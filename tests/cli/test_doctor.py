@@ -7,7 +7,6 @@ from __future__ import annotations
 import contextlib
 import json
 import socket
-import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,6 +17,7 @@ import zenoh
 from support.cell import LEFT, Daemon, Tracker, until
 from support.cell_commands import started
 from support.driven_arms import driven
+from support.repeated import repeated
 from thirdhand.arms.simulated import SimulatedArm
 from thirdhand.client import endpoints, open_session
 from thirdhand.command_line import main
@@ -51,18 +51,9 @@ def simulated(endpoint: str) -> Iterator[SimulatedArm]:
 @contextlib.contextmanager
 def misnamed(session: zenoh.Session) -> Iterator[None]:
     """A tracker that publishes under a misspelled key."""
-    stop = threading.Event()
     pose = messages.PoseStamped(1, "base", LEFT, (0.0, 0.0, 0.0, 1.0))
-
-    def publish() -> None:
-        while not stop.wait(0.02):
-            session.put("thirdhand/hands/Left", cdr.encode_pose(pose))
-
-    thread = threading.Thread(target=publish)
-    thread.start()
-    yield
-    stop.set()
-    thread.join(10)
+    with repeated(lambda: session.put("thirdhand/hands/Left", cdr.encode_pose(pose)), 0.02):
+        yield
 
 
 def findings(

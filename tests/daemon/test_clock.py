@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+import sys
 import threading
 from pathlib import Path
 
@@ -229,8 +231,13 @@ def test_deadline_whose_preparation_fails_is_still_to_come() -> None:
 def test_processors_stay_awake_only_if_wished_and_allowed(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    for name in ("_scheduled", "_locked"):
-        monkeypatch.setattr(clock_module, name, lambda: False)
+    for owner, name in (
+        (clock_module, "_scheduled"),
+        (clock_module, "_locked"),
+        (gc, "freeze"),
+        (sys, "setswitchinterval"),
+    ):
+        monkeypatch.setattr(owner, name, lambda *_: False)
     latency = tmp_path / "cpu_dma_latency"
     monkeypatch.setattr(clock_module, "AWAKE", str(latency))
     assert not ask_for_real_time().awake

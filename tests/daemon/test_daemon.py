@@ -21,6 +21,7 @@ from support.cell import LEFT, RIGHT, Tracker, serving, thirdhand, told
 from support.cell_commands import assert_refused, python, succeeded
 from support.in_process import arm
 from support.paths import ROOT
+from support.recorded import frames_of
 from support.wam import JOINT_NAMES
 from thirdhand.command_line import main
 from thirdhand.contract import cdr, messages, requests
@@ -88,8 +89,7 @@ def test_a_session_from_start_to_end(tmp_path: Path) -> None:
     (recording,) = records.glob("*.mcap")
     result = replay(recording, output=tmp_path / "whole.mcap")
     assert result.exact, result.text()
-    whole = Recording.open(tmp_path / "whole.mcap")
-    frames = np.array([step.frame for step in whole.steps() if step.frame is not None])
+    frames = frames_of(tmp_path / "whole.mcap")
     assert not frames["joint_velocities"][-1].any()
     notes = [text for _, text, _ in Recording.open(recording).notes("requests")]
     assert any("handover" in note for note in notes)

@@ -5,14 +5,15 @@ its topic, and missing joints are named.
 from __future__ import annotations
 
 import contextlib
+import itertools
 import math
-import threading
 import time
 from collections.abc import Callable, Iterator
 
 import pytest
 
 from support.cell import Daemon, serving
+from support.repeated import repeated
 from thirdhand.contract import cdr
 from thirdhand.contract.messages import JointState
 from thirdhand.settings.config import Settings
@@ -39,24 +40,15 @@ def state(*names: str, velocity: tuple[float, ...] | None = None, **others: floa
 @contextlib.contextmanager
 def published(daemon: Daemon, messages: Callable[[int], list[JointState]]) -> Iterator[None]:
     """A context in which `messages(k)` are published every 4 ms, k = 0, 1, ..."""
-    publisher = daemon.session.declare_publisher("thirdhand/joints/state")
-    ended = threading.Event()
+    counted = itertools.count()
+    with daemon.session.declare_publisher("thirdhand/joints/state") as publisher:
 
-    def publish() -> None:
-        k = 0
-        while not ended.wait(0.004):
-            for message in messages(k):
+        def publish() -> None:
+            for message in messages(next(counted)):
                 publisher.put(cdr.encode_joints(message))
-            k += 1
 
-    publishing = threading.Thread(target=publish)
-    publishing.start()
-    try:
-        yield
-    finally:
-        ended.set()
-        publishing.join()
-        publisher.undeclare()
+        with repeated(publish, 0.004):
+            yield
 
 
 CASES: dict[str, Callable[[int], list[JointState]]] = {

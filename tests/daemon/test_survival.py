@@ -85,7 +85,7 @@ def test_failed_part_is_a_fault_and_all_goes_on(tmp_path: Path) -> None:
     assert [gap.lost for gap in result.missing] == [1, 1]  # the ticks at which the loop failed
 
 
-def test_failure_of_whatever_follows_is_a_fault_too(tmp_path: Path) -> None:
+def test_failure_while_following_is_a_fault_too(tmp_path: Path) -> None:
     """Each rehearsal and each tick fail until the tick that takes in the fault."""
     sabotage = SABOTAGE.format(folder=str(tmp_path))
     with (

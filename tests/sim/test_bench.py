@@ -20,6 +20,7 @@ import zenoh
 from support.cell import thirdhand
 from support.cell_commands import started
 from support.demo import SCENE, Bytes, Sample
+from support.repeated import repeated
 from support.wam import JOINT_NAMES
 from thirdhand.client import endpoints, open_session
 from thirdhand.contract import cdr, channels, messages
@@ -317,20 +318,13 @@ def test_arm_elsewhere_is_scored(network: tuple[zenoh.Session, str]) -> None:
     state = cdr.encode_joints(messages.JointState(1, JOINT_NAMES, joints, STILL))
     publisher = listening.declare_publisher("lab/joints/state")
     keys = list[str]()
-    over = threading.Event()
     heard = [
         listening.declare_subscriber(f"lab/{key}", lambda sample: keys.append(str(sample.key_expr)))
         for key in ("joints/state", "hands/left", "objects")
     ]
-
-    def tell() -> None:
-        while not over.wait(0.01):
-            publisher.put(state)
-
     Service(listening, "lab")
     reports: list[RunReport] = []
     script = HandScript(SCENE, seed=1, speed=20.0)
-    arm = threading.Thread(target=tell)
     with Bench(script, world=ObservedWorld) as bench, open_session(connect=[endpoint]) as session:
 
         def play_live(live: Live) -> None:
@@ -339,12 +333,8 @@ def test_arm_elsewhere_is_scored(network: tuple[zenoh.Session, str]) -> None:
         with pytest.raises(BenchError, match="no joint states arrive on lab/joints/state"):
             play_live(Live(cell="lab", wait_s=1.0))
         assert set(keys) == {"lab/hands/left", "lab/objects"}
-        arm.start()
-        try:
+        with repeated(lambda: publisher.put(state)):
             play_live(Live(cell="lab", once=True))
-        finally:
-            over.set()
-            arm.join()
     (report,) = reports
     assert len(heard) == 3
     assert report.events.handover.reached

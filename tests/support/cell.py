@@ -29,13 +29,12 @@ RIGHT = (0.98, 0.32, 0.06)
 
 
 def thirdhand(
-    *arguments: str, timeout: float = 60, **more: Any
+    *arguments: str, timeout: float = 60, cwd: Path = ROOT, **more: Any
 ) -> subprocess.CompletedProcess[str]:
     """A `thirdhand` command, run to its end."""
     command = [sys.executable, "-m", "thirdhand", *arguments]
-    more = {"cwd": ROOT} | more
     return subprocess.run(
-        command, capture_output=True, text=True, timeout=timeout, check=False, **more
+        command, capture_output=True, text=True, timeout=timeout, check=False, cwd=cwd, **more
     )
 
 
